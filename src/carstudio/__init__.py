@@ -1,0 +1,22 @@
+"""Car-Studio: from photographs of cars to metric, camera-registered, editable 3-D cars in driving scenes."""
+
+from importlib import import_module
+from typing import Any
+
+__version__ = "0.1.0"
+
+# Public name -> module that defines it; loaded on first use, so that `import carstudio` stays quick.
+_HOMES = {
+    "Camera": "carstudio.geometry.camera",
+    "Box3D": "carstudio.geometry.box3d",
+    "InputError": "carstudio.errors",
+    "load_model": "carstudio.training.checkpoint",
+    "open_store": "carstudio.dataset.store",
+}
+__all__ = ["Box3D", "Camera", "InputError", "load_model", "open_store"]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOMES:
+        return getattr(import_module(_HOMES[name]), name)
+    raise AttributeError(f"module 'carstudio' has no attribute {name!r}")

@@ -1,0 +1,98 @@
+"""The one place where pixels enter and leave: 8-bit RGB images, 8-bit masks, 16-bit depth.
+
+Arrays are numpy, (height, width[, channels]). Depth images follow KITTI: value / 256 is metres, 0 is "no depth".
+"""
+
+import io
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Shaped, UInt8
+from PIL import Image, ImageOps, UnidentifiedImageError
+
+from carstudio.errors import InputError
+from carstudio.files import write_bytes
+
+MAX_IMAGE_PIXELS = 120_000_000  # 12,000 x 10,000: larger than any camera's photo, small enough for a laptop's memory
+DEPTH_STEPS_PER_METRE = 256.0  # KITTI's depth PNG
+
+
+def decode_image(data: bytes, *, name: str, mode: str = "RGB") -> UInt8[np.ndarray, "height width *channels"]:
+    """Pixels of an encoded image as `mode` ("RGB" or "L"), EXIF orientation applied once.
+
+    Raises `InputError` naming `name` when the bytes are not a whole image or exceed `MAX_IMAGE_PIXELS`.
+    """
+    image = _open(data, name)
+    try:
+        image = ImageOps.exif_transpose(image)
+        if mode == "RGB" and image.mode in ("I;16", "I;16B", "I"):
+            image = Image.fromarray((np.asarray(image).astype(np.uint32) >> 8).clip(0, 255).astype(np.uint8))
+        return np.array(image.convert(mode))
+    except (OSError, ValueError, SyntaxError, EOFError) as error:
+        raise InputError(f"{name}: image is broken or truncated ({error}); replace or remove the file") from error
+
+
+def _open(data: bytes, name: str) -> Image.Image:
+    if not data:
+        raise InputError(f"{name}: expected an image, found an empty file; replace or remove it")
+    try:
+        image = Image.open(io.BytesIO(data))
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
+        raise InputError(f"{name}: expected an image (PNG, JPEG, ...), found something else ({error})") from error
+    except Image.DecompressionBombError as error:
+        raise InputError(f"{name}: {error}; at most {MAX_IMAGE_PIXELS} pixels are read") from error
+    if image.width * image.height > MAX_IMAGE_PIXELS:
+        raise InputError(f"{name}: {image.width} x {image.height} pixels, at most {MAX_IMAGE_PIXELS} are read; scale it")
+    return image
+
+
+def image_size(data: bytes, *, name: str) -> tuple[int, int]:
+    """(width, height) without decoding the pixels."""
+    return _open(data, name).size
+
+
+def read_image(path: Path | str, *, mode: str = "RGB") -> UInt8[np.ndarray, "height width *channels"]:
+    """`decode_image` of a file."""
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: image cannot be read ({error.strerror})") from error
+    return decode_image(data, name=str(path), mode=mode)
+
+
+def encode_png(pixels: Shaped[np.ndarray, "height width *channels"]) -> bytes:
+    """PNG bytes of an 8-bit (grey or RGB) or 16-bit (grey) array."""
+    assert pixels.dtype in (np.uint8, np.uint16), pixels.dtype
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "PNG", compress_level=6)
+    return buffer.getvalue()
+
+
+def encode_jpeg(pixels: UInt8[np.ndarray, "height width 3"], *, quality: int) -> bytes:
+    """JPEG bytes with 4:2:0 chroma, as cameras write them."""
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "JPEG", quality=quality)
+    return buffer.getvalue()
+
+
+def write_png(path: Path | str, pixels: Shaped[np.ndarray, "height width *channels"]) -> None:
+    """Write an array as PNG, atomically."""
+    write_bytes(path, encode_png(pixels))
+
+
+def encode_depth(depth_m: Float[np.ndarray, "height width"]) -> bytes:
+    """16-bit PNG in steps of 1/256 m; non-finite or non-positive depth becomes 0 ("none")."""
+    steps = np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m * DEPTH_STEPS_PER_METRE, 0.0)
+    return encode_png(np.clip(np.round(steps), 0, 65535).astype(np.uint16))
+
+
+def decode_depth(data: bytes, *, name: str) -> Float[np.ndarray, "height width"]:
+    """Metres, NaN where there is no depth."""
+    steps = np.array(_open(data, name)).astype(np.float32)
+    return np.where(steps > 0, steps / DEPTH_STEPS_PER_METRE, np.nan).astype(np.float32)
+
+
+def to_uint8(rgb: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
+    """[0, 1] floats to 8 bit, rounded, clipped."""
+    return np.clip(np.round(rgb * 255.0), 0, 255).astype(np.uint8)
