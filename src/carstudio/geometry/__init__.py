@@ -1,0 +1,1 @@
+"""Cameras, boxes, canonical frame and overlap: pure tensor functions."""

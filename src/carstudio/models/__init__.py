@@ -1,0 +1,1 @@
+"""Category models of cars behind one interface."""

@@ -1,0 +1,1 @@
+"""2-D boxes, masks and 3-D boxes: one small adapter per component."""

@@ -1,0 +1,1 @@
+"""Rays, cones, samples, encodings and volume rendering; the field arrives as a function."""

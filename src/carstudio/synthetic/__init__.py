@@ -1,0 +1,1 @@
+"""Cars and photographs made here, with exact truth."""
