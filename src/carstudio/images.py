@@ -42,7 +42,9 @@ def _open(data: bytes, name: str) -> Image.Image:
     except Image.DecompressionBombError as error:
         raise InputError(f"{name}: {error}; at most {MAX_IMAGE_PIXELS} pixels are read") from error
     if image.width * image.height > MAX_IMAGE_PIXELS:
-        raise InputError(f"{name}: {image.width} x {image.height} pixels, at most {MAX_IMAGE_PIXELS} are read; scale it")
+        raise InputError(
+            f"{name}: {image.width} x {image.height} pixels, at most {MAX_IMAGE_PIXELS} are read; scale it"
+        )
     return image
 
 
