@@ -37,6 +37,7 @@ class RichProgress:
         self._progress.stop()
 
     def __call__(self, description: str, done: int, total: int, note: str = "") -> None:
+        """Draw the bar of `description` at `done` of `total`."""
         if description not in self._tasks:
             self._tasks[description] = self._progress.add_task(description, total=total, note="")
         self._progress.update(self._tasks[description], completed=done, total=total, note=note)

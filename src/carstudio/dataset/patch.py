@@ -1,7 +1,7 @@
 """A CarPatch3D patch: one crop of one photograph with its camera, 3-D box, mask and measured scores.
 
-`PatchRecord` is the row as stored (images as encoded bytes; columns as documented in docs/dataset_format.md); `Patch` is
-the row decoded, with the camera of the crop. Patch pixel (u, v) is frame pixel (crop_x0 + u, crop_y0 + v).
+`PatchRecord` is the row as stored (images as encoded bytes; columns as documented in docs/dataset_format.md); `Patch`
+is the row decoded, with the camera of the crop. Patch pixel (u, v) is frame pixel (crop_x0 + u, crop_y0 + v).
 """
 
 from dataclasses import dataclass
