@@ -1,0 +1,116 @@
+"""Image encoders: photo crops to one feature vector per car (Car-Studio section III-C).
+
+`resnet34` is the paper's: ResNet-34 from transformers, features of the stem and the first three stages up-sampled to
+the stem's size, concatenated (64 + 64 + 128 + 256 = 512 channels) and max-pooled. `small` is for CPUs.
+"""
+
+import logging
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+logger = logging.getLogger(__name__)
+
+RESNET34_HUB_NAME = "microsoft/resnet-34"
+
+
+@dataclass(frozen=True)
+class EncoderConfig:
+    """Which encoder turns the crop into features."""
+
+    kind: Literal["resnet34", "small"] = "resnet34"
+    """"resnet34": the paper's; "small": a few convolutions, 4 ms a patch on one core."""
+    side_px: int = 128
+    """Side of the square the crop is resized to (released: 128)."""
+    pretrained: str | None = RESNET34_HUB_NAME
+    """Hub name or folder of ImageNet weights for resnet34; None: start from random weights."""
+    num_features: int = 512
+    """Length of the feature vector (512 for resnet34, fixed)."""
+    sees_mask: bool = False
+    """Also feed the mask as a fourth channel (small only; the paper's encoder sees the photo alone)."""
+
+    def __post_init__(self) -> None:
+        if self.kind == "resnet34":
+            assert self.num_features == 512, "resnet34 gives 512 features"
+            assert not self.sees_mask, "resnet34 sees the photo alone"
+
+
+class ResNet34Encoder(nn.Module):
+    """The paper's global encoder; 512 features."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        from transformers import ResNetConfig, ResNetModel
+
+        config = ResNetConfig(depths=[3, 4, 6, 3], hidden_sizes=[64, 128, 256, 512], layer_type="basic")
+        backbone = ResNetModel(config)
+        self.embedder = backbone.embedder.embedder  # conv1 + batch norm + relu
+        self.pool = nn.MaxPool2d(kernel_size=3, stride=2, padding=1)
+        self.stages = nn.ModuleList(backbone.encoder.stages[:3])
+
+    def load_pretrained(self, name: str) -> None:
+        """ImageNet weights from the hub or a folder; raises OSError when they cannot be had."""
+        from transformers import ResNetModel
+
+        loaded = ResNetModel.from_pretrained(name)
+        self.embedder.load_state_dict(loaded.embedder.embedder.state_dict())
+        for ours, theirs in zip(self.stages, loaded.encoder.stages[:3], strict=True):
+            ours.load_state_dict(theirs.state_dict())
+
+    def forward(
+        self, image: Float[Tensor, "batch 3 side side"], mask: Float[Tensor, "batch side side"]
+    ) -> Float[Tensor, "batch 512"]:
+        """Global features; `mask` is ignored, as in the paper."""
+        stem = self.embedder((image - 0.5) / 0.5)
+        features, maps = self.pool(stem), [stem]
+        for stage in self.stages:
+            features = stage(features)
+            maps.append(features)
+        size = stem.shape[-2:]
+        resized = [nn.functional.interpolate(m, size, mode="bilinear", align_corners=True) for m in maps]
+        return torch.cat(resized, dim=1).amax(dim=(-2, -1))
+
+
+class SmallEncoder(nn.Module):
+    """Strided convolutions with group norm down to 4 x 4, then one linear map: keeps where things are in the crop."""
+
+    def __init__(self, config: EncoderConfig) -> None:
+        super().__init__()
+        channels = [4 if config.sees_mask else 3, 32, 64, 96, 128]
+        layers: list[nn.Module] = []
+        for inside, outside in pairwise(channels):
+            layers += [nn.Conv2d(inside, outside, 3, stride=2, padding=1), nn.GroupNorm(8, outside), nn.SiLU()]
+        self.convolutions = nn.Sequential(*layers, nn.AdaptiveAvgPool2d(4), nn.Flatten())
+        self.linear = nn.Linear(channels[-1] * 16, config.num_features)
+        self.sees_mask = config.sees_mask
+
+    def forward(
+        self, image: Float[Tensor, "batch 3 side side"], mask: Float[Tensor, "batch side side"]
+    ) -> Float[Tensor, "batch feature"]:
+        """Features of the crop (and of the mask where the config says so)."""
+        pixels = (image - 0.5) / 0.5
+        if self.sees_mask:
+            pixels = torch.cat([pixels, mask[:, None]], dim=1)
+        return nn.functional.silu(self.linear(self.convolutions(pixels)))
+
+
+def build_encoder(config: EncoderConfig) -> nn.Module:
+    """The encoder a config names, with random weights (`load_imagenet` replaces them)."""
+    return ResNet34Encoder() if config.kind == "resnet34" else SmallEncoder(config)
+
+
+def load_imagenet(encoder: nn.Module, config: EncoderConfig) -> str:
+    """Load ImageNet weights where the config asks for them; says in words what the encoder now starts from."""
+    if not isinstance(encoder, ResNet34Encoder) or config.pretrained is None:
+        return "random weights"
+    try:
+        encoder.load_pretrained(config.pretrained)
+    except OSError as error:
+        message = f"random weights ({config.pretrained} is not on this machine and cannot be downloaded)"
+        logger.warning("encoder: %s: %s", message, str(error).splitlines()[0])
+        return message
+    return f"ImageNet weights of {config.pretrained}"

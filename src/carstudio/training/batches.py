@@ -1,0 +1,145 @@
+"""What one training step sees: patches to encode, pixels to explain. All randomness comes from (seed, step).
+
+The sampler has no state: the patches of step k are found from the seed alone, so a run resumes in mid-epoch exactly.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from carstudio.dataset.patch import MaskValue
+from carstudio.dataset.pixels import PatchCache, PreparedPatch
+from carstudio.geometry.box3d import Box3D
+from carstudio.geometry.camera import Camera
+from carstudio.models.interface import PatchBatch
+from carstudio.rendering.rays import Rays, pixel_rays
+
+Supervision = Literal["single-view", "multi-view", "mixed"]
+_STREAMS = {"epoch": 1, "target": 2, "pixels": 3, "jitter": 4}
+
+
+def generator_for(seed: int, step: int, stream: str) -> torch.Generator:
+    """A CPU generator for one purpose of one step; streams and steps never share numbers."""
+    mixed = (seed * 0x9E3779B97F4A7C15 + step * 0xBF58476D1CE4E5B9 + _STREAMS[stream] * 0x94D049BB133111EB) % 2**63
+    return torch.Generator().manual_seed(mixed)
+
+
+@dataclass(frozen=True)
+class PixelBatch:
+    """Rays through pixels of target patches and what was photographed there.
+
+    `alpha` is 1 on the car; `is_known` is False where the mask says unknown: such pixels take part in no loss.
+    """
+
+    rays: Rays
+    box: Box3D
+    rgb: Float[Tensor, "batch ray 3"]
+    alpha: Float[Tensor, "batch ray"]
+    is_known: Bool[Tensor, "batch ray"]
+
+    def to(self, device: torch.device | str) -> "PixelBatch":
+        """The same pixels on another device."""
+        moved = (self.rgb.to(device), self.alpha.to(device), self.is_known.to(device))
+        return PixelBatch(self.rays.to(device), self.box.to(device), *moved)
+
+
+def patch_batch(patches: list[PreparedPatch]) -> PatchBatch:
+    """Stack prepared patches for the encoder."""
+    side = patches[0].encoder_camera.width
+    intrinsics = torch.stack([patch.encoder_camera.intrinsics for patch in patches])
+    return PatchBatch(
+        image=torch.stack([patch.encoder_image for patch in patches]).float() / 255,
+        mask=torch.stack([patch.encoder_mask for patch in patches]).float() / 255,
+        camera=Camera(intrinsics, side, side),
+        box=stack_boxes([patch.box for patch in patches]),
+        instance_ids=tuple(patch.instance_id for patch in patches),
+    )
+
+
+def stack_boxes(boxes: list[Box3D]) -> Box3D:
+    """A batch of boxes from single ones."""
+    return Box3D(
+        torch.stack([box.center for box in boxes]),
+        torch.stack([box.size for box in boxes]),
+        torch.stack([box.rotation for box in boxes]),
+    )
+
+
+def pixel_batch(patches: list[PreparedPatch], rays_per_patch: int, generator: torch.Generator) -> PixelBatch:
+    """Pixels drawn evenly, with replacement, from the whole crop of each patch (patches of any size will do)."""
+    positions, rgb, mask = [], [], []
+    for patch in patches:
+        height, width = patch.mask.shape
+        picked = torch.randint(height * width, (rays_per_patch,), generator=generator)
+        positions.append(torch.stack([picked % width, picked // width], dim=-1).float() + 0.5)
+        rgb.append(patch.rgb.view(-1, 3)[picked])
+        mask.append(patch.mask.view(-1)[picked])
+    intrinsics = torch.stack([patch.camera.intrinsics for patch in patches])
+    values = torch.stack(mask)
+    return PixelBatch(
+        rays=pixel_rays(Camera(intrinsics, 0, 0), torch.stack(positions)),
+        box=stack_boxes([patch.box for patch in patches]),
+        rgb=torch.stack(rgb).float() / 255,
+        alpha=(values == MaskValue.CAR).float(),
+        is_known=values != MaskValue.UNKNOWN,
+    )
+
+
+class StepSampler:
+    """Which patches a step encodes and which it explains.
+
+    Every patch is encoded once per epoch. `single-view` explains the encoded patch itself (the paper); `multi-view`
+    another patch of the same car where it has one; `mixed` either with equal chance.
+    """
+
+    def __init__(
+        self, cache: PatchCache, patch_ids: list[str], *, patches_per_step: int, supervision: Supervision, seed: int
+    ) -> None:
+        assert patch_ids, "no patches to train on"
+        self.cache, self.patch_ids, self.seed = cache, patch_ids, seed
+        self.patches_per_step, self.supervision = patches_per_step, supervision
+        table = cache.store.table(["patch_id", "instance_id"])
+        instance_of = dict(zip(table["patch_id"].to_pylist(), table["instance_id"].to_pylist(), strict=True))
+        self._instance_of = {patch_id: instance_of[patch_id] for patch_id in patch_ids}
+        self._views: dict[str, list[str]] = {}
+        for patch_id in patch_ids:
+            self._views.setdefault(self._instance_of[patch_id], []).append(patch_id)
+        self._epoch = -1
+        self._order: list[int] = []
+
+    def input_ids(self, step: int) -> list[str]:
+        """Patches that step `step` encodes; steps run on over the ends of epochs."""
+        first = step * self.patches_per_step
+        return [self._at(position) for position in range(first, first + self.patches_per_step)]
+
+    def _at(self, position: int) -> str:
+        epoch, place = divmod(position, len(self.patch_ids))
+        if epoch != self._epoch:
+            generator = generator_for(self.seed, epoch, "epoch")
+            self._order, self._epoch = torch.randperm(len(self.patch_ids), generator=generator).tolist(), epoch
+        return self.patch_ids[self._order[place]]
+
+    def target_ids(self, step: int, input_ids: list[str]) -> list[str]:
+        """The patch that each encoded patch must explain."""
+        if self.supervision == "single-view":
+            return input_ids
+        generator = generator_for(self.seed, step, "target")
+        return [self._target(patch_id, torch.rand(2, generator=generator).tolist()) for patch_id in input_ids]
+
+    def _target(self, patch_id: str, draws: list[float]) -> str:
+        others = [view for view in self._views[self._instance_of[patch_id]] if view != patch_id]
+        if not others or (self.supervision == "mixed" and draws[0] < 0.5):
+            return patch_id
+        return others[int(draws[1] * len(others))]
+
+    def batch(self, step: int, rays_per_patch: int) -> tuple[PatchBatch, PixelBatch]:
+        """Everything step `step` needs."""
+        inputs = self.input_ids(step)
+        targets = self.target_ids(step, inputs)
+        pixels = pixel_batch(
+            [self.cache[patch_id] for patch_id in targets], rays_per_patch, generator_for(self.seed, step, "pixels")
+        )
+        return patch_batch([self.cache[patch_id] for patch_id in inputs]), pixels

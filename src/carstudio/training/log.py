@@ -1,0 +1,57 @@
+"""The training log: one JSON object per line, and TensorBoard where it is installed."""
+
+import json
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from carstudio.errors import InputError
+from carstudio.files import write_text
+
+
+class TrainingLog:
+    """Appends to `log.jsonl`; opening at a step drops what a killed run logged beyond it, so no line is double."""
+
+    def __init__(self, folder: Path, *, resume_step: int) -> None:
+        self.path = folder / "log.jsonl"
+        kept = [row for row in read_log(self.path) if row["step"] <= resume_step] if self.path.exists() else []
+        write_text(self.path, "".join(json.dumps(row) + "\n" for row in kept))
+        self._file = self.path.open("a", encoding="utf-8")
+        self._board = _summary_writer(folder / "tensorboard", resume_step)
+
+    def write(self, row: dict[str, Any]) -> None:
+        """Add one line (`row["step"]` is the number of finished steps)."""
+        self._file.write(json.dumps(row) + "\n")
+        self._file.flush()
+        if self._board is not None:
+            for key, value in row.items():
+                if key != "step" and isinstance(value, (int, float)):
+                    self._board.add_scalar(key, value, row["step"])
+
+    def close(self) -> None:
+        """Flush and close."""
+        self._file.close()
+        if self._board is not None:
+            self._board.close()
+
+
+def _summary_writer(folder: Path, resume_step: int) -> Any:
+    if find_spec("tensorboard") is None:
+        return None
+    from torch.utils.tensorboard import SummaryWriter
+
+    return SummaryWriter(str(folder), purge_step=resume_step + 1)
+
+
+def read_log(path: Path) -> list[dict[str, Any]]:
+    """Rows of a log; a last line that a kill cut short is dropped, any other broken line is an `InputError`."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    rows = []
+    for number, line in enumerate(lines, start=1):
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError as error:
+            if number == len(lines):
+                break
+            raise InputError(f"{path} line {number}: expected a JSON object, found {line[:60]!r}") from error
+    return rows
