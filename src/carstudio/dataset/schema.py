@@ -1,0 +1,97 @@
+"""CarPatch3D's columns as an Arrow schema, and rows to and from `PatchRecord`.
+
+The columns are `PatchRecord`'s fields in their order. Images, masks and depth are `{bytes, path}` structs, and the
+schema carries the feature description that makes Hugging Face `datasets` decode them as pictures.
+"""
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Any
+
+import pyarrow as pa
+
+from carstudio.dataset.patch import PatchRecord
+from carstudio.errors import InputError
+
+PICTURES = ("image", "mask", "depth")  # columns that hold encoded pictures
+TUPLES = ("camera_offset", "box2d", "box_center", "box_size", "box_rotation")
+_INTEGERS = (
+    "frame_index", "frame_width", "frame_height", "crop_x0", "crop_y0", "crop_width", "crop_height", "occlusion",
+)  # fmt: skip
+_FLOATS = (
+    "fx", "fy", "cx", "cy", "box_yaw", "score_2d", "score_mask", "score_3d", "mask_ratio", "box_iou", "truncation",
+)  # fmt: skip
+_OPTIONAL = {f.name for f in fields(PatchRecord) if f.type is not str and "None" in str(f.type)}
+_SAFE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+_JPEG_MAGIC = b"\xff\xd8"
+
+
+def _arrow_type(name: str) -> pa.DataType:
+    if name in PICTURES:
+        return pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+    if name in TUPLES:
+        return pa.list_(pa.float64())
+    if name in _INTEGERS:
+        return pa.int32()
+    return pa.float64() if name in _FLOATS else pa.string()
+
+
+def _hugging_face_feature(name: str) -> dict[str, Any]:
+    if name in PICTURES:
+        return {"_type": "Image"}
+    if name in TUPLES:
+        return {"feature": {"dtype": "float64", "_type": "Value"}, "_type": "Sequence"}
+    return {"dtype": str(_arrow_type(name)).replace("double", "float64"), "_type": "Value"}
+
+
+COLUMNS = tuple(field.name for field in fields(PatchRecord))
+LIGHT_COLUMNS = tuple(name for name in COLUMNS if name not in PICTURES)
+SCHEMA = pa.schema(
+    [pa.field(name, _arrow_type(name), nullable=name in _OPTIONAL) for name in COLUMNS],
+    metadata={
+        "huggingface": json.dumps({"info": {"features": {name: _hugging_face_feature(name) for name in COLUMNS}}})
+    },
+)
+
+
+def check_id(value: str, what: str) -> str:
+    """`value` when it may serve as a file name on every system; `InputError` otherwise."""
+    if not _SAFE_ID.fullmatch(value) or value.endswith("."):
+        raise InputError(
+            f"{what} {value!r}: expected 1 to 100 letters, digits, '.', '_' or '-', first a letter or digit, last no dot"
+        )
+    return value
+
+
+def _picture_cell(data: bytes | None, patch_id: str) -> dict[str, Any] | None:
+    if data is None:
+        return None
+    suffix = "jpg" if data.startswith(_JPEG_MAGIC) else "png"
+    return {"bytes": data, "path": f"{patch_id}.{suffix}"}
+
+
+def table_from_records(records: Sequence[PatchRecord]) -> pa.Table:
+    """Rows in the order given."""
+    columns: dict[str, list[Any]] = {}
+    for name in COLUMNS:
+        values = [getattr(record, name) for record in records]
+        if name in PICTURES:
+            values = [_picture_cell(data, record.patch_id) for data, record in zip(values, records, strict=True)]
+        columns[name] = values
+    return pa.table(columns, schema=SCHEMA)
+
+
+def record_from_row(row: Mapping[str, Any]) -> PatchRecord:
+    """The record of one row as `pyarrow` gives it (`table.to_pylist()`)."""
+    values: dict[str, Any] = {}
+    for name in COLUMNS:
+        value = row[name]
+        if value is not None:
+            if name in PICTURES:
+                value = value["bytes"]
+            elif name in TUPLES:
+                value = tuple(value)
+        values[name] = value
+    return PatchRecord(**values)

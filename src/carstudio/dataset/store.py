@@ -1,0 +1,213 @@
+"""Reading a CarPatch3D store: a folder of Parquet that pandas, DuckDB and Hugging Face `datasets` open as well.
+
+`data/` holds every candidate and never changes; verdicts and splits lie beside it, keyed by patch_id.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from carstudio.dataset.manifest import Manifest, data_sha256, read_manifest
+from carstudio.dataset.patch import Patch, PatchRecord
+from carstudio.dataset.schema import LIGHT_COLUMNS, SCHEMA, check_id, record_from_row
+from carstudio.dataset.verdicts import Verdict, table_from_verdicts, verdicts_from_table
+from carstudio.dataset.verify import verify_store
+from carstudio.dataset.writer import StoreWriter, describe_shard, shard_paths, write_table
+from carstudio.errors import InputError
+
+__all__ = ["PatchStore", "StoreWriter", "open_store"]
+
+PARTS = ("train", "test")
+_CACHED_GROUPS = 2  # decoded row groups kept, so that reading in order decodes each group once
+
+
+@dataclass(frozen=True)
+class Location:
+    """Where a patch lies: shard, row group in it, row in the group."""
+
+    shard: int
+    group: int
+    row: int
+
+
+def open_store(path: Path | str) -> "PatchStore":
+    """Open a store for reading; `InputError` when there is none or its format is newer than this program."""
+    return PatchStore(Path(path), read_manifest(Path(path)))
+
+
+class PatchStore:
+    """A store opened for reading; what it reads is cached, so open it again after writing. Can be pickled."""
+
+    def __init__(self, path: Path, manifest: Manifest) -> None:
+        self.path = path
+        self.manifest = manifest
+        self._read_group = lru_cache(_CACHED_GROUPS)(self._read_group_now)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return open_store, (self.path,)
+
+    def __len__(self) -> int:
+        """Number of candidates, kept or not."""
+        return sum(file.metadata.num_rows for file in self._files)
+
+    @cached_property
+    def _files(self) -> list[pq.ParquetFile]:
+        paths = shard_paths(self.path)
+        missing = {shard.name for shard in self.manifest.shards} - {path.name for path in paths}
+        if missing:
+            raise InputError(f"{self.path}: shards {sorted(missing)} are missing; restore them or rebuild the store")
+        return [_open_shard(path) for path in paths]
+
+    @cached_property
+    def data_sha256(self) -> str:
+        """One checksum for all shards (as the manifest lists them; computed for an unfinished store)."""
+        if self.manifest.is_finished:
+            return data_sha256((shard.name, shard.sha256) for shard in self.manifest.shards)
+        return data_sha256((s.name, s.sha256) for s in map(describe_shard, shard_paths(self.path)))
+
+    def table(self, columns: list[str] | None = None) -> pa.Table:
+        """Rows of all candidates in store order; by default every column but the pictures."""
+        columns = list(LIGHT_COLUMNS) if columns is None else columns
+        unknown = [name for name in columns if not self._files or name not in self._files[0].schema_arrow.names]
+        if unknown and self._files:
+            raise InputError(f"{self.path}: no column {unknown}; there are {self._files[0].schema_arrow.names}")
+        if not self._files:
+            return SCHEMA.empty_table().select(columns)
+        return pa.concat_tables([file.read(columns=columns) for file in self._files])
+
+    @cached_property
+    def _locations(self) -> dict[str, Location]:
+        locations: dict[str, Location] = {}
+        for shard, file in enumerate(self._files):
+            ids = file.read(columns=["patch_id"])["patch_id"].to_pylist()
+            start = 0
+            for group in range(file.num_row_groups):
+                stop = start + file.metadata.row_group(group).num_rows
+                locations |= {ids[i]: Location(shard, group, i - start) for i in range(start, stop)}
+                start = stop
+        return locations
+
+    def patch_ids(self, *, kept: bool = True, split: str | None = None, part: str = "all") -> list[str]:
+        """Ids in store order: kept ones only (a patch without a verdict counts as kept), of a split's part."""
+        if part not in (*PARTS, "all"):
+            raise InputError(f"part {part!r}: expected train, test or all")
+        if part != "all" and split is None:
+            raise InputError(f"part {part!r} needs the name of a split; this store has {self.split_names()}")
+        ids: Iterable[str] = self._locations
+        if kept:
+            rejected = {verdict.patch_id for verdict in self.verdicts() if not verdict.is_kept}
+            ids = (patch_id for patch_id in ids if patch_id not in rejected)
+        if split is not None:
+            parts = self.split(split)
+            wanted = PARTS if part == "all" else (part,)
+            ids = (patch_id for patch_id in ids if parts.get(patch_id) in wanted)
+        return list(ids)
+
+    def _read_group_now(self, shard: int, group: int) -> pa.Table:
+        return self._files[shard].read_row_group(group)
+
+    def record(self, patch_id: str) -> PatchRecord:
+        """One patch as stored."""
+        location = self._locations.get(patch_id)
+        if location is None:
+            raise InputError(
+                f"{self.path}: no patch {patch_id!r} among {len(self)}; `carstudio dataset info` lists them"
+            )
+        table = self._read_group(location.shard, location.group)
+        return record_from_row(table.slice(location.row, 1).to_pylist()[0])
+
+    def patch(self, patch_id: str) -> Patch:
+        """One patch decoded."""
+        return self.record(patch_id).decode()
+
+    def verdicts(self) -> list[Verdict]:
+        """What the filters decided; empty when nobody judged yet."""
+        path = self.path / "verdicts.parquet"
+        return verdicts_from_table(_read_side_table(path)) if path.is_file() else []
+
+    def write_verdicts(self, verdicts: Iterable[Verdict]) -> None:
+        """Replace the verdicts; `InputError` when one is about a patch that is not in the store."""
+        verdicts = list(verdicts)
+        self._check_known((verdict.patch_id for verdict in verdicts), "verdicts")
+        write_table(self.path / "verdicts.parquet", table_from_verdicts(verdicts))
+
+    def split_names(self) -> list[str]:
+        """Names of the splits this store has."""
+        return sorted(path.stem for path in (self.path / "splits").glob("*.parquet"))
+
+    def split(self, name: str) -> dict[str, str]:
+        """patch_id -> "train" or "test"."""
+        path = self.path / "splits" / f"{check_id(name, 'split name')}.parquet"
+        if not path.is_file():
+            raise InputError(f"{self.path}: no split {name!r}; there are {self.split_names()}")
+        table = _read_side_table(path)
+        return dict(zip(table["patch_id"].to_pylist(), table["part"].to_pylist(), strict=True))
+
+    def write_split(self, name: str, parts: Mapping[str, str]) -> None:
+        """Write split `name` (patch_id -> "train" or "test"), in store order."""
+        check_id(name, "split name")
+        self._check_known(parts, f"split {name}")
+        assert set(parts.values()) <= set(PARTS), set(parts.values())
+        ids = [patch_id for patch_id in self._locations if patch_id in parts]
+        table = pa.table({"patch_id": ids, "part": [parts[patch_id] for patch_id in ids]}, schema=_SPLIT_SCHEMA)
+        write_table(self.path / "splits" / f"{name}.parquet", table)
+
+    def _check_known(self, patch_ids: Iterable[str], what: str) -> None:
+        unknown = [patch_id for patch_id in patch_ids if patch_id not in self._locations]
+        if unknown:
+            raise InputError(
+                f"{self.path}: {what} name {len(unknown)} patches that are not there, first {unknown[0]!r}"
+            )
+
+    def verify(self) -> list[str]:
+        """Problems found by reading everything: checksums, pictures, sizes, boxes. Empty when the store is sound."""
+        return verify_store(self)
+
+    def info(self) -> dict[str, Any]:
+        """Counts: patches, instances, per source, per verdict reason, splits, sizes."""
+        table = self.table(["patch_id", "instance_id", "source", "licence", "crop_height"])
+        verdicts = self.verdicts()
+        kept = set(self.patch_ids())
+        instances = zip(table["patch_id"].to_pylist(), table["instance_id"].to_pylist(), strict=True)
+        heights = Counter(32 * (height // 32) for height in table["crop_height"].to_pylist())
+        return {
+            "path": str(self.path),
+            "format_version": self.manifest.format_version,
+            "is_finished": self.manifest.is_finished,
+            "data_sha256": self.data_sha256,
+            "patches": len(self),
+            "kept": len(kept),
+            "instances": len(set(table["instance_id"].to_pylist())),
+            "kept_instances": len({instance for patch_id, instance in instances if patch_id in kept}),
+            "sources": dict(sorted(Counter(table["source"].to_pylist()).items())),
+            "licences": dict(sorted(Counter(table["licence"].to_pylist()).items())),
+            "reasons": dict(Counter(verdict.reason for verdict in verdicts).most_common()),
+            "unjudged": len(self) - len(verdicts),
+            "splits": {name: dict(sorted(Counter(self.split(name).values()).items())) for name in self.split_names()},
+            "crop_height_px": {f"{low}-{low + 31}": heights[low] for low in sorted(heights)},
+        }
+
+
+_SPLIT_SCHEMA = pa.schema(
+    [pa.field("patch_id", pa.string(), nullable=False), pa.field("part", pa.string(), nullable=False)]
+)
+
+
+def _open_shard(path: Path) -> pq.ParquetFile:
+    try:
+        return pq.ParquetFile(path, memory_map=True)
+    except (pa.ArrowException, OSError) as error:
+        raise InputError(f"{path}: expected a Parquet file, found something else ({error}); restore it") from error
+
+
+def _read_side_table(path: Path) -> pa.Table:
+    try:
+        return pq.read_table(path)
+    except (pa.ArrowException, OSError) as error:
+        raise InputError(f"{path}: expected a Parquet file, found something else ({error}); restore it") from error
