@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from carstudio.models.encoders import EncoderConfig, build_encoder
+from carstudio.models.encoders import EncoderConfig, build_encoder, load_imagenet
 from carstudio.models.field_model import FieldModel
 from carstudio.models.interface import Latents, PatchBatch
 from carstudio.rendering.cones import Gaussians
@@ -70,6 +70,10 @@ class CarNeRF(FieldModel):
         if config.colour_skip_px:
             self.colour_skip = nn.Linear(3 * config.colour_skip_px**2, config.code_size)
         self.field = CarNeRFField(config)
+
+    def load_pretrained_parts(self) -> str:
+        """ImageNet weights for the encoder where the config asks for them and they can be had."""
+        return load_imagenet(self.encoder, self.config.encoder)
 
     def encode(self, patches: PatchBatch) -> Latents:
         """z_shape and z_texture of each patch."""

@@ -53,6 +53,10 @@ class CategoryModel(nn.Module):
 
     encoder_side_px: int
 
+    def load_pretrained_parts(self) -> str:
+        """Load what a config asks to start from (an ImageNet encoder); says in words what the encoder starts from."""
+        return "random weights"
+
     def encode(self, patches: PatchBatch) -> Latents:
         """Latents of the cars in the patches."""
         raise NotImplementedError

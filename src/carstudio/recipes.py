@@ -1,0 +1,70 @@
+"""Named recipes: functions that return a whole training config. Variants come by `dataclasses.replace`."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from carstudio.errors import InputError
+from carstudio.models.car_nerf import CarNeRFConfig
+from carstudio.models.encoders import EncoderConfig
+from carstudio.rendering.field import SamplingConfig
+from carstudio.training.losses import LossConfig
+from carstudio.training.schedule import ScheduleConfig
+from carstudio.training.trainer import TrainConfig
+
+
+def car_nerf() -> TrainConfig:
+    """Car-NeRF at paper size: ResNet-34, 8 x 256, 128 + 128 samples, masked colour and mask loss, 500k steps."""
+    return TrainConfig()
+
+
+def car_nerf_no_mask() -> TrainConfig:
+    """The paper's row without mask loss: colour over the whole crop, the background against black."""
+    return replace(car_nerf(), recipe="car-nerf-no-mask", loss=LossConfig(colour="whole-crop", mask_weight=0.0))
+
+
+def car_nerf_as_released() -> TrainConfig:
+    """Car-NeRF with the released code's encoding, cone and whole-crop colour loss, for comparing."""
+    model = CarNeRFConfig(released_encoding=True, sampling=SamplingConfig(cone_map="isotropic-as-released"))
+    return replace(car_nerf(), recipe="car-nerf-as-released", model=model, loss=LossConfig(colour="whole-crop"))
+
+
+def car_nerf_small() -> TrainConfig:
+    """Car-NeRF for a laptop's CPU: 4 x 128, small encoder, normalised codes, 8 x 8 colour skip, clipped gradients."""
+    model = CarNeRFConfig(
+        encoder=EncoderConfig(kind="small", side_px=64, pretrained=None, num_features=256, sees_mask=True),
+        sampling=SamplingConfig(coarse=32, fine=0),
+        width=128,
+        depth=4,
+        skip_after=None,
+        position_frequencies=8,
+        direction_frequencies=2,
+        normalise_codes=True,
+        colour_skip_px=8,
+        encode_pose=True,
+    )
+    return TrainConfig(
+        recipe="car-nerf-small",
+        model=model,
+        loss=LossConfig(colour="whole-crop"),
+        schedule=ScheduleConfig(first=2e-3, last=1e-4, decay_steps=None, warmup_steps=100),
+        supervision="mixed",
+        patches_per_step=16,
+        rays_per_patch=128,
+        steps=4_000,
+        clip_gradient=1.0,
+    )
+
+
+RECIPES: dict[str, Callable[[], TrainConfig]] = {
+    "car-nerf": car_nerf,
+    "car-nerf-no-mask": car_nerf_no_mask,
+    "car-nerf-as-released": car_nerf_as_released,
+    "car-nerf-small": car_nerf_small,
+}
+
+
+def recipe(name: str) -> TrainConfig:
+    """The recipe of that name; `InputError` lists the names there are."""
+    if name not in RECIPES:
+        raise InputError(f"recipe must be one of {', '.join(RECIPES)}, found {name!r}")
+    return RECIPES[name]()

@@ -1,0 +1,116 @@
+"""Models on disk: `model.safetensors` + `model.json`; nothing is ever unpickled.
+
+`model.json` holds format version, model config, provenance and the sha256 of the weights beside it.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from carstudio.errors import InputError
+from carstudio.files import atomic_path, read_json, sha256_file, write_json
+from carstudio.models.interface import CategoryModel
+from carstudio.models.zoo import ModelConfig, build_model, config_from_json, config_to_json
+
+FORMAT_VERSION = 1
+WEIGHTS, DESCRIPTION = "model.safetensors", "model.json"
+
+
+@dataclass(frozen=True)
+class ModelDescription:
+    """What `model.json` says: the config to build the model from, where it came from, and its weights' checksum."""
+
+    config: ModelConfig
+    provenance: dict[str, Any]
+    sha256: str
+
+
+def save_model(folder: Path, model: CategoryModel, config: ModelConfig, provenance: dict[str, Any]) -> str:
+    """Write weights, then description; returns the weights' sha256."""
+    save_tensors(folder / WEIGHTS, {name: tensor for name, tensor in model.state_dict().items()})
+    checksum = sha256_file(folder / WEIGHTS)
+    value = {
+        "format_version": FORMAT_VERSION,
+        "config": config_to_json(config),
+        "provenance": provenance,
+        "sha256": checksum,
+    }
+    write_json(folder / DESCRIPTION, value)
+    return checksum
+
+
+def save_tensors(path: Path, tensors: dict[str, torch.Tensor], metadata: dict[str, str] | None = None) -> None:
+    """Write tensors as safetensors, atomically."""
+    on_cpu = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    with atomic_path(path) as partial:
+        save_file(on_cpu, partial, metadata=metadata)
+
+
+def load_tensors(path: Path) -> dict[str, torch.Tensor]:
+    """Read a safetensors file; `InputError` when it is missing, cut short or something else."""
+    try:
+        return load_file(path)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file; expected the weights of a model") from error
+    except (SafetensorError, OSError, ValueError) as error:
+        raise InputError(f"{path}: not a whole safetensors file ({error}); train again or copy it again") from error
+
+
+def describe_model(folder: Path | str) -> ModelDescription:
+    """Read and check `model.json` of a run or model folder."""
+    folder = Path(folder)
+    path = folder / DESCRIPTION
+    if not path.exists():
+        raise InputError(f"{folder}: expected a trained model ({DESCRIPTION} and {WEIGHTS}), found none; see `train`")
+    value = read_json(path)
+    if not isinstance(value, dict) or value.get("format_version") != FORMAT_VERSION:
+        found = value.get("format_version") if isinstance(value, dict) else value
+        raise InputError(f"{path}: expected format_version {FORMAT_VERSION}, found {found!r}; update carstudio")
+    config = config_from_json(value.get("config"), name=str(path))
+    return ModelDescription(config, value.get("provenance", {}), str(value.get("sha256")))
+
+
+def load_model(path_or_name: Path | str, *, device: torch.device | str = "cpu") -> CategoryModel:
+    """The model of a run folder, ready to encode, trace and render (evaluation mode)."""
+    folder = Path(path_or_name)
+    description = describe_model(folder)
+    tensors = load_tensors(folder / WEIGHTS)
+    if sha256_file(folder / WEIGHTS) != description.sha256:
+        raise InputError(
+            f"{folder / WEIGHTS}: sha256 differs from the one in {DESCRIPTION}; the two do not belong together"
+        )
+    model = build_model(description.config)
+    load_weights(model, tensors, name=str(folder / WEIGHTS))
+    return model.to(device).eval()
+
+
+def load_weights(model: torch.nn.Module, tensors: dict[str, torch.Tensor], *, name: str) -> None:
+    """`load_state_dict` with an error a user can read: names what is missing, left over or of another shape."""
+    expected = model.state_dict()
+    missing, extra = sorted(expected.keys() - tensors.keys()), sorted(tensors.keys() - expected.keys())
+    if missing or extra:
+        raise InputError(f"{name}: weights of another model: missing {missing[:4]}, left over {extra[:4]}")
+    for key, tensor in tensors.items():
+        if tensor.shape != expected[key].shape:
+            raise InputError(f"{name}: {key} has shape {list(tensor.shape)}, expected {list(expected[key].shape)}")
+    model.load_state_dict(tensors)
+
+
+def pick_device(name: str) -> torch.device:
+    """Pick a device: "auto" is CUDA, else Apple's MPS, else the CPU; anything else as torch names it."""
+    if name == "auto":
+        if torch.cuda.is_available():
+            return torch.device("cuda")
+        return torch.device("mps" if torch.backends.mps.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise InputError(
+            f"device {name!r} cannot be used here ({str(error).splitlines()[0]}); try --device cpu"
+        ) from error
+    return device

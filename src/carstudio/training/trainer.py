@@ -1,0 +1,242 @@
+"""The training loop: one straight line per step, everything random drawn from (seed, step)."""
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from carstudio.dataset.pixels import PatchCache
+from carstudio.dataset.store import PatchStore
+from carstudio.errors import InputError
+from carstudio.models.car_nerf import CarNeRFConfig
+from carstudio.models.interface import CategoryModel
+from carstudio.models.zoo import ModelConfig, build_model
+from carstudio.progress import Report, silent
+from carstudio.rendering.rays import to_canonical
+from carstudio.rendering.volume import composite
+from carstudio.training.batches import StepSampler, Supervision, generator_for
+from carstudio.training.checkpoint import pick_device, save_model
+from carstudio.training.log import TrainingLog
+from carstudio.training.losses import LossConfig, masked_psnr, training_loss
+from carstudio.training.resume import TrainingState, load_state, save_state
+from carstudio.training.schedule import ScheduleConfig, learning_rate
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything that decides a run, data aside; the defaults are the paper's (FACTS: 3 x 1,024 pixels, RAdam)."""
+
+    recipe: str = "car-nerf"
+    """Name of the recipe it came from; rows and tables call the model by it."""
+    model: ModelConfig = field(default_factory=CarNeRFConfig)
+    """The model."""
+    loss: LossConfig = field(default_factory=LossConfig)
+    """Terms of the loss."""
+    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
+    """Learning rate."""
+    supervision: Supervision = "single-view"
+    """Which photo of the car an encoded photo must explain."""
+    patches_per_step: int = 3
+    """Cars encoded per step."""
+    rays_per_patch: int = 1024
+    """Pixels per patch and step."""
+    steps: int = 500_000
+    """Length of the run."""
+    minutes: float | None = None
+    """Stop after this much time instead, and let the learning rate follow the clock."""
+    clip_gradient: float | None = None
+    """Largest gradient norm; None: not clipped, as released."""
+    seed: int = 0
+    """Start of all randomness."""
+    split: str | None = "instance"
+    """Split whose training part is used; None: all kept patches."""
+    log_every: int = 20
+    """Steps per line of log.jsonl."""
+    save_every: int = 500
+    """Steps between checkpoints."""
+
+
+@dataclass(frozen=True)
+class TrainSummary:
+    """What a finished run did."""
+
+    folder: str
+    steps: int
+    seconds: float
+    rays_per_s: float
+    psnr: float
+    encoder_start: str
+    sha256: str
+
+
+def train(
+    config: TrainConfig,
+    store: PatchStore,
+    out: Path,
+    *,
+    device: str = "auto",
+    resume: bool = False,
+    provenance: dict[str, Any] | None = None,
+    report: Report = silent,
+    on_save: Callable[[CategoryModel, int], None] | None = None,
+) -> TrainSummary:
+    """Train a model on a store's kept patches and leave it in `out` (model, log, state to resume from).
+
+    `on_save(model, step)` is called after each checkpoint, for pictures. Killed at any moment and resumed, a run by
+    steps ends with the same bits on a CPU as an uninterrupted one.
+    """
+    run = _Run(config, store, out, pick_device(device), resume, provenance or {})
+    try:
+        while not run.is_done():
+            figures = run.one_step()
+            if run.step % config.log_every == 0 or run.is_done():
+                run.log(figures)
+            report("training", *run.progress(), f"PSNR {run.psnr:.2f} dB  {run.rays_per_s:,.0f} rays/s")
+            if run.step % config.save_every == 0 or run.is_done():
+                run.save()
+                if on_save is not None:
+                    on_save(run.model, run.step)
+    finally:
+        run.close()
+    return run.summary()
+
+
+class _Run:
+    """The parts of a run that live from step to step."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        store: PatchStore,
+        out: Path,
+        device: torch.device,
+        resume: bool,
+        provenance: dict[str, Any],
+    ) -> None:
+        self.config, self.out, self.device, self.provenance = config, out, device, provenance
+        patch_ids = store.patch_ids(kept=True, split=config.split, part="train")
+        if not patch_ids:
+            raise InputError(f"{store.path}: no kept patch in the training part of split {config.split!r}")
+        torch.manual_seed(config.seed)
+        self.model = build_model(config.model).to(device)
+        self.encoder_start = "resumed"
+        self.optimizer = torch.optim.RAdam(self.model.parameters(), lr=config.schedule.first, eps=1e-8)
+        self.step, self.seconds, self.psnr, self.rays_per_s = 0, 0.0, math.nan, 0.0
+        if resume:
+            self._restore(load_state(out))
+        elif (out / "training.safetensors").exists():
+            raise InputError(f"{out} holds a run already; add --resume to go on with it, or choose another --out")
+        else:
+            self.encoder_start = self.model.load_pretrained_parts()
+        cache = PatchCache(store, self.model.encoder_side_px)
+        self.sampler = StepSampler(
+            cache,
+            patch_ids,
+            patches_per_step=config.patches_per_step,
+            supervision=config.supervision,
+            seed=config.seed,
+        )
+        self.trainlog = TrainingLog(out, resume_step=self.step)
+        self._resumed_step, self._resumed_seconds = self.step, self.seconds
+        self._started = time.monotonic()
+        self._processor_started = time.process_time()
+
+    def _restore(self, state: TrainingState) -> None:
+        state.into(self.model, self.optimizer)
+        self.step, self.seconds = state.step, state.seconds
+
+    def fraction(self) -> float:
+        """Share of the run's budget that is spent."""
+        if self.config.minutes is not None:
+            return min(1.0, self._elapsed() / (60 * self.config.minutes))
+        return self.step / self.config.steps
+
+    def is_done(self) -> bool:
+        return self.step > 0 and self.fraction() >= 1.0
+
+    def progress(self) -> tuple[int, int]:
+        """(done, total) for a progress bar: steps, or seconds of a run by time."""
+        if self.config.minutes is not None:
+            return round(self._elapsed()), round(60 * self.config.minutes)
+        return self.step, self.config.steps
+
+    def _elapsed(self) -> float:
+        return self._resumed_seconds + time.monotonic() - self._started
+
+    def one_step(self) -> dict[str, float]:
+        """Encode, trace, compare, update; returns the loss terms."""
+        config = self.config
+        rate = learning_rate(config.schedule, self.step, self.fraction())
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        patches, pixels = self.sampler.batch(self.step, config.rays_per_patch)
+        patches, pixels = patches.to(self.device), pixels.to(self.device)
+        jitter = generator_for(config.seed, self.step, "jitter")
+
+        self.model.train()
+        latents = self.model.encode(patches)
+        levels = self.model.trace_levels(pixels.rays, latents, pixels.box, jitter)
+        renderings = tuple(composite(segments) for segments in levels)
+        counts = pixels.is_known & to_canonical(pixels.rays, pixels.box).hit
+        terms = training_loss(renderings, pixels.rgb, pixels.alpha, counts, config.loss)
+        loss = torch.stack(list(terms.values())).sum()
+        figures = {name: float(term.detach()) for name, term in terms.items()}
+        self._refuse_nan(figures, patches.instance_ids)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        if config.clip_gradient is not None:
+            torch.nn.utils.clip_grad_norm_(self.model.parameters(), config.clip_gradient)
+        self.optimizer.step()
+
+        self.step += 1
+        self.seconds = self._elapsed()
+        self.psnr = masked_psnr(renderings[-1], pixels.rgb, pixels.alpha * counts)
+        steps_here = self.step - self._resumed_step
+        rays = steps_here * config.patches_per_step * config.rays_per_patch
+        self.rays_per_s = rays / max(time.monotonic() - self._started, 1e-9)
+        return {"loss": sum(figures.values()), **figures, "learning_rate": rate, "psnr": self.psnr}
+
+    def _refuse_nan(self, figures: dict[str, float], instance_ids: tuple[str, ...]) -> None:
+        broken = [name for name, value in figures.items() if not math.isfinite(value)]
+        if broken:
+            raise FloatingPointError(
+                f"step {self.step}: loss term {broken[0]} is {figures[broken[0]]} for cars {list(instance_ids)}; "
+                f"the last checkpoint in {self.out} is sound: lower the learning rate and --resume"
+            )
+
+    def log(self, figures: dict[str, float]) -> None:
+        """One line of the log."""
+        row: dict[str, Any] = {"step": self.step, **figures}
+        if self.config.minutes is not None:
+            row["seconds"] = round(self.seconds, 3)
+        self.trainlog.write(row)
+
+    def save(self) -> None:
+        """The model for its users, then the state to resume from."""
+        provenance = {
+            **self.provenance,
+            "recipe": self.config.recipe,
+            "training": dataclasses.asdict(self.config),
+            "step": self.step,
+        }
+        self.checksum = save_model(self.out, self.model, self.config.model, provenance)
+        save_state(self.out, TrainingState.of(self.model, self.optimizer, step=self.step, seconds=self.seconds))
+
+    def close(self) -> None:
+        self.trainlog.close()
+
+    def summary(self) -> TrainSummary:
+        return TrainSummary(
+            folder=str(self.out),
+            steps=self.step,
+            seconds=round(self.seconds, 3),
+            rays_per_s=round(self.rays_per_s, 1),
+            psnr=round(self.psnr, 3),
+            encoder_start=self.encoder_start,
+            sha256=self.checksum,
+        )
