@@ -21,7 +21,7 @@ def repo_root() -> Path:
 
 @pytest.fixture(scope="session")
 def test_data(repo_root: Path) -> Path:
-    """Folder of real inputs (KITTI frames, meshes, ONNX models): CARSTUDIO_TEST_DATA, else ../shared/data; else skip."""
+    """Folder of real inputs (KITTI, meshes, ONNX files): CARSTUDIO_TEST_DATA, else ../shared/data; else skip."""
     named = os.environ.get("CARSTUDIO_TEST_DATA")
     folder = Path(named).expanduser() if named else repo_root.parent / "shared" / "data"
     if not folder.is_dir():
