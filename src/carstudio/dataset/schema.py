@@ -60,7 +60,7 @@ def check_id(value: str, what: str) -> str:
     """`value` when it may serve as a file name on every system; `InputError` otherwise."""
     if not _SAFE_ID.fullmatch(value) or value.endswith("."):
         raise InputError(
-            f"{what} {value!r}: expected 1 to 100 letters, digits, '.', '_' or '-', first a letter or digit, last no dot"
+            f"{what} {value!r}: expected 1 to 100 letters, digits, '.', '_' or '-', no mark first, no dot last"
         )
     return value
 

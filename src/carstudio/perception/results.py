@@ -1,0 +1,76 @@
+"""What perception returns, and the protocols of those who return it.
+
+Perception knows nothing of stores: a mask comes as two boolean images, car and unknown, which the dataset encodes.
+Positions are px of the whole photograph, pixel (u, v) centred at (u + 0.5, v + 0.5).
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+
+@dataclass(frozen=True)
+class Window:
+    """A rectangle of whole pixels: the crop that a mask belongs to."""
+
+    x0: int
+    y0: int
+    width: int
+    height: int
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Rows and columns of the window in the photograph."""
+        return slice(self.y0, self.y0 + self.height), slice(self.x0, self.x0 + self.width)
+
+    def within(self, outer: "Window") -> "Window":
+        """The same pixels, counted from the corner of `outer`."""
+        return Window(self.x0 - outer.x0, self.y0 - outer.y0, self.width, self.height)
+
+
+@dataclass(frozen=True)
+class Detection2D:
+    """A 2-D box (x0, y0, x1, y1 px) with its class name and confidence in [0, 1]."""
+
+    box2d: tuple[float, float, float, float]
+    type: str
+    score: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmentRequest:
+    """One car to be segmented. Hulls are convex outlines of projected 3-D boxes, in order around the outline."""
+
+    image: UInt8[np.ndarray, "frame_height frame_width 3"]
+    window: Window
+    box2d: tuple[float, float, float, float]
+    hull: Float[np.ndarray, "n 2"] | None = None  # of this car; None: no 3-D box
+    occluders: tuple[Float[np.ndarray, "_ 2"], ...] = ()  # of nearer objects
+    patch_id: str = ""
+    frame_id: str = ""
+    truth_mask: bytes | None = None  # PNG of the window, where the source knows the exact mask
+
+
+@dataclass(frozen=True)
+class MaskResult:
+    """Masks of the window; no pixel is both. `score`: the segmenter's confidence in [0, 1], None: it has none."""
+
+    car: Bool[np.ndarray, "height width"]
+    unknown: Bool[np.ndarray, "height width"]
+    score: float | None = None
+
+
+class Segmenter(Protocol):
+    """Finds the visible pixels of one car; can be pickled, gives the same mask each time it is asked."""
+
+    def segment(self, request: SegmentRequest) -> MaskResult:
+        """Masks of `request.window`; pixels of nearer objects are unknown."""
+
+
+class Detector(Protocol):
+    """Finds cars in a photograph."""
+
+    def detect(self, image: UInt8[np.ndarray, "height width 3"]) -> list[Detection2D]:
+        """Boxes in descending order of confidence."""
