@@ -29,6 +29,7 @@ class Manifest:
     sources: tuple[str, ...]
     shards: tuple[Shard, ...] = ()
     is_finished: bool = False
+    resume_key: str | None = None  # of an unfinished write: goes on only with the same key
     format_version: int = FORMAT_VERSION
 
     @property
@@ -50,6 +51,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
         "format": FORMAT,
         "format_version": manifest.format_version,
         "is_finished": manifest.is_finished,
+        "resume_key": manifest.resume_key,
         "sources": list(manifest.sources),
         "num_patches": manifest.num_patches,
         "shards": shards,
@@ -84,5 +86,6 @@ def _manifest_from_json(content: dict[str, Any]) -> Manifest:
         sources=tuple(content["sources"]),
         shards=tuple(Shard(**shard) for shard in content["shards"]),
         is_finished=bool(content["is_finished"]),
+        resume_key=content.get("resume_key"),
         format_version=content["format_version"],
     )

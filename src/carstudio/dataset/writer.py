@@ -65,9 +65,9 @@ def _shard_writer(path: Path) -> Iterator[Callable[[list[PatchRecord]], None]]:
 class StoreWriter:
     """Adds patches to a new store (`mode="create"`) or to one that exists (`mode="append"`).
 
-    `create` on an unfinished store that never was finished starts over, or with `resume=True` goes on after its whole
-    shards: `has(patch_id)` tells which patches need not be made again. Leaving the `with` block by an exception keeps
-    the whole shards and leaves the store unfinished.
+    `create` on a store that never was finished goes on after its whole shards when both were given the same
+    `resume_key`, and starts over otherwise; `has(patch_id)` tells which patches need not be made again. Leaving the
+    `with` block by an exception keeps the whole shards and leaves the store unfinished.
     """
 
     def __init__(
@@ -76,23 +76,24 @@ class StoreWriter:
         *,
         source: str,
         mode: str = "create",
-        resume: bool = False,
+        resume_key: str | None = None,
         groups_per_shard: int = GROUPS_PER_SHARD,
     ) -> None:
         assert mode in ("create", "append"), mode
         self.path = Path(path)
-        self.source = source
         self._rows_per_shard = ROWS_PER_GROUP * groups_per_shard
         previous = self._previous_manifest(mode)
-        if mode == "create" and not resume:
+        if mode == "create" and (resume_key is None or resume_key != previous.resume_key):
             for shard in shard_paths(self.path):
                 shard.unlink()
-        self._remove_partial_shards()
-        self._finished = {shard.name: shard for shard in previous.shards}
-        self._manifest = Manifest(tuple(sorted({*previous.sources, source})), previous.shards)
+        for leftover in (self.path / "data").glob(".part-*.partial.parquet"):
+            leftover.unlink()
+        sources = tuple(sorted({*previous.sources, source}))
+        self._manifest = Manifest(sources, previous.shards, resume_key=resume_key)
         write_manifest(self.path, self._manifest)
-        self._num_shards = len(shard_paths(self.path))
-        self._ids = {patch_id for shard in shard_paths(self.path) for patch_id in _patch_ids(shard)}
+        shards = shard_paths(self.path)
+        self._num_shards = len(shards)
+        self._ids = {patch_id for shard in shards for patch_id in _patch_ids(shard)}
         self._pending: list[PatchRecord] = []
 
     def _previous_manifest(self, mode: str) -> Manifest:
@@ -112,15 +113,15 @@ class StoreWriter:
                 f"{self.path}: already holds a finished store of {previous.num_patches} patches; "
                 "choose another --out or remove the folder"
             )
-        return Manifest(())
-
-    def _remove_partial_shards(self) -> None:
-        for leftover in (self.path / "data").glob(".part-*.partial.parquet"):
-            leftover.unlink()
+        return previous
 
     def has(self, patch_id: str) -> bool:
         """Whether the store holds this patch already."""
         return patch_id in self._ids
+
+    def ids(self) -> frozenset[str]:
+        """Ids of all patches so far."""
+        return frozenset(self._ids)
 
     def __len__(self) -> int:
         return len(self._ids)
@@ -150,7 +151,8 @@ class StoreWriter:
         """Write the last shard and the checksums: the store is finished."""
         self._flush()
         (self.path / "data").mkdir(exist_ok=True)
-        shards = tuple(self._finished.get(path.name) or describe_shard(path) for path in shard_paths(self.path))
+        finished = {shard.name: shard for shard in self._manifest.shards}
+        shards = tuple(finished.get(path.name) or describe_shard(path) for path in shard_paths(self.path))
         write_manifest(self.path, Manifest(self._manifest.sources, shards, is_finished=True))
 
     def __enter__(self) -> "StoreWriter":

@@ -1,0 +1,174 @@
+"""`carstudio build`: a source of photographs in, a CarPatch3D store out.
+
+Frames are worked on in processes and written in order, so that the number of workers changes no byte. An interrupted
+build goes on where it stopped when it is started again with the same settings.
+"""
+
+import hashlib
+import json
+import multiprocessing
+import os
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import torch
+
+from carstudio.dataset.candidates import FrameResult, records_of_frame
+from carstudio.dataset.filters import FilterRecipe, judge
+from carstudio.dataset.runs import write_run
+from carstudio.dataset.sources.frame import FrameRef, Source
+from carstudio.dataset.sources.kitti_det import open_kitti_det
+from carstudio.dataset.sources.kitti_mot import open_kitti_mot
+from carstudio.dataset.splits import write_splits
+from carstudio.dataset.store import PatchStore, StoreWriter, open_store
+from carstudio.dataset.summary import BuildSummary, count_reasons
+from carstudio.dataset.verdicts import Verdict
+from carstudio.errors import InputError
+from carstudio.perception.results import Segmenter
+from carstudio.perception.specs import make_segmenter
+from carstudio.progress import Report, silent
+
+__all__ = ["BuildConfig", "BuildSummary", "build"]
+
+_CHUNK = 4  # frames handed to a process at once
+
+
+@dataclass(frozen=True)
+class BuildConfig:
+    """What to build from what."""
+
+    source: Literal["kitti-det", "kitti-mot"]
+    """Kind of input."""
+    root: Path
+    """Folder of the source, in its official layout (the folder with image_2 or image_02, or its parent)."""
+    out: Path
+    """Folder of the store; must be new, empty or an unfinished store."""
+    frames: str | None = None
+    """Frame numbers A-B, both included; all when absent."""
+    sequence: str | None = None
+    """KITTI-MOT: one sequence, such as 0001; all when absent."""
+    segmenter: str = "grabcut"
+    """grabcut (needs no weights), onnx:FILE (better on real frames), precomputed:FOLDER or ground-truth."""
+    types: tuple[str, ...] = ("Car",)
+    """Label types that become candidates; objects of every type hide those behind them."""
+    filters: FilterRecipe = field(default_factory=FilterRecipe)
+    """Thresholds of the filters."""
+    workers: int = 0
+    """Processes; 0 takes one per core. Changes nothing in the result."""
+
+
+@dataclass(frozen=True)
+class FrameJob:
+    """All that a process needs to turn frames into records."""
+
+    source: Source
+    segmenter: Segmenter
+    types: tuple[str, ...]
+    done: frozenset[str]  # patches that an interrupted build has written already
+
+    def __call__(self, ref: FrameRef) -> FrameResult:
+        """Records of one frame; a broken frame becomes a problem."""
+        try:
+            return records_of_frame(
+                self.source.load(ref),
+                self.segmenter,
+                source=self.source.name,
+                licence=self.source.licence,
+                types=self.types,
+                done=self.done,
+            )
+        except InputError as error:
+            return FrameResult((), (f"frame {ref.stem} skipped: {error}",))
+
+
+def build(config: BuildConfig, report: Report = silent) -> BuildSummary:
+    """Make the store `config.out`; verdicts and splits are written at the end."""
+    start = time.perf_counter()
+    source = open_source(config)
+    segmenter = make_segmenter(config.segmenter)
+    refs = source.frames()
+    problems = list(source.problems)
+    with StoreWriter(config.out, source=source.name, resume_key=_resume_key(config)) as writer:
+        write_run(config.out, asdict(config))
+        job = FrameJob(source, segmenter, config.types, writer.ids())
+        for done, result in enumerate(_run(job, refs, _num_workers(config.workers, len(refs))), start=1):
+            for record in result.records:
+                writer.append(record)
+            problems += result.problems
+            report("build", done, len(refs), f"{len(writer)} candidates")
+    store = open_store(config.out)
+    verdicts = judge_store(store, config.filters)
+    summary = summarize(store, source=source.name, verdicts=verdicts)
+    return replace(summary, problems=tuple(problems), seconds=time.perf_counter() - start)
+
+
+def open_source(config: BuildConfig) -> Source:
+    """The source that the config names."""
+    if config.source == "kitti-det":
+        if config.sequence is not None:
+            raise InputError("--sequence is for kitti-mot; kitti-det has no sequences")
+        return open_kitti_det(config.root, frames=config.frames)
+    return open_kitti_mot(config.root, sequence=config.sequence, frames=config.frames)
+
+
+def judge_store(store: PatchStore, recipe: FilterRecipe) -> list[Verdict]:
+    """Judge every patch again by its stored values and replace the store's verdicts."""
+    verdicts = [judge(store.record(patch_id), recipe) for patch_id in store.patch_ids(kept=False)]
+    store.write_verdicts(verdicts)
+    return verdicts
+
+
+def summarize(store: PatchStore, *, source: str, verdicts: list[Verdict]) -> BuildSummary:
+    """Write the splits over the kept patches and count everything."""
+    splits = write_splits(store)
+    info = store.info()
+    return BuildSummary(
+        out=store.path,
+        source=source,
+        candidates=len(store),
+        kept=info["kept"],
+        instances=info["kept_instances"],
+        reasons=count_reasons(verdicts),
+        splits=splits,
+    )
+
+
+def _resume_key(config: BuildConfig) -> str:
+    """What must be equal for an interrupted build to go on: all that decides the records."""
+    settings = {key: value for key, value in asdict(config).items() if key not in ("out", "filters", "workers", "root")}
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
+
+
+def _num_workers(workers: int, num_frames: int) -> int:
+    if workers < 0:
+        raise InputError(f"--workers must be 0 (one per core) or more, found {workers}")
+    return min(workers or os.cpu_count() or 1, max(1, num_frames // 8))  # a process takes seconds to start
+
+
+def _run(job: FrameJob, refs: Sequence[FrameRef], workers: int) -> Iterator[FrameResult]:
+    """Results in the order of `refs`."""
+    if workers == 1:
+        yield from map(job, refs)
+        return
+    chunks = [refs[i : i + _CHUNK] for i in range(0, len(refs), _CHUNK)]
+    context = multiprocessing.get_context("spawn")  # torch and onnxruntime have threads: forking them is not safe
+    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+        waiting: deque[Future[list[FrameResult]]] = deque()
+        for chunk in chunks:
+            waiting.append(pool.submit(_work, job, chunk))
+            if len(waiting) > 2 * workers:  # keeps memory bounded
+                yield from waiting.popleft().result()
+        while waiting:
+            yield from waiting.popleft().result()
+
+
+def _work(job: FrameJob, refs: Sequence[FrameRef]) -> list[FrameResult]:
+    cv2.setNumThreads(1)  # one process per core, one thread per process
+    torch.set_num_threads(1)
+    return [job(ref) for ref in refs]
