@@ -1,0 +1,62 @@
+"""`carstudio build`: labelled photographs -> CarPatch3D."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from carstudio.commands.command import Outcome, Output, plain
+from carstudio.dataset.build import BuildConfig, build
+from carstudio.dataset.filters import FilterRecipe
+from carstudio.dataset.summary import BuildSummary
+
+
+@dataclass(frozen=True, kw_only=True)
+class Build(Output):
+    """Make a CarPatch3D store: crops, boxes, masks, cameras, and a verdict with its reason for every candidate."""
+
+    source: tyro.conf.Positional[Literal["kitti-det", "kitti-mot"]]
+    """Kind of input."""
+    root: Path
+    """Folder of the source in its official layout."""
+    out: Path
+    """The store to write."""
+    frames: str | None = None
+    """Frame numbers A-B, both included; all when absent."""
+    sequence: str | None = None
+    """KITTI-MOT: one sequence, such as 0001; all when absent."""
+    segmenter: str = "grabcut"
+    """grabcut (no weights), onnx:FILE (better on real frames), precomputed:FOLDER."""
+    filters: tyro.conf.OmitArgPrefixes[FilterRecipe] = field(default_factory=FilterRecipe)
+    """Thresholds; the released ones by default."""
+    workers: int = 0
+    """Processes; 0: one per core. Changes nothing in the result."""
+
+    def run(self) -> Outcome:
+        """Build and say what was kept and why the rest was not."""
+        config = BuildConfig(
+            source=self.source,
+            root=self.root,
+            out=self.out,
+            frames=self.frames,
+            sequence=self.sequence,
+            segmenter=self.segmenter,
+            filters=self.filters,
+            workers=self.workers,
+        )
+        with self.progress() as report:
+            summary = build(config, report)
+        return Outcome(describe(summary), plain(summary))
+
+
+def describe(summary: BuildSummary) -> str:
+    """A build's counts as a few lines of text."""
+    lines = [
+        f"{summary.out}: {summary.candidates} candidates in {summary.seconds:.1f} s, {summary.kept} kept "
+        f"({summary.instances} cars)"
+    ]
+    lines += [f"  {count:6d}  {reason}" for reason, count in summary.reasons.items()]
+    lines += [f"  split {name}: {parts}" for name, parts in summary.splits.items()]
+    lines += [f"  problem: {problem}" for problem in summary.problems]
+    return "\n".join(lines)

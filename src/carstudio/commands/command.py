@@ -1,0 +1,65 @@
+"""What every verb shares: the options `--json` and `--quiet`, and what it hands back to be printed."""
+
+import dataclasses
+import shlex
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from carstudio import __version__
+from carstudio.progress import Report, RichProgress, silent
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a verb did: text for people, a JSON value for programs."""
+
+    text: str
+    value: dict[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Output:
+    """Options of every verb."""
+
+    json: bool = False
+    """Print a machine-readable result."""
+    quiet: bool = False
+    """No progress bars."""
+
+    @contextmanager
+    def progress(self) -> Iterator[Report]:
+        """Bars on a terminal, silence with --quiet, --json or when the output is no terminal."""
+        if self.quiet or self.json or not sys.stdout.isatty():
+            yield silent
+            return
+        with RichProgress() as bars:
+            yield bars
+
+
+class Command(Protocol):
+    """A parsed verb."""
+
+    json: bool
+
+    def run(self) -> Outcome:
+        """Do the work."""
+
+
+def plain(value: Any) -> Any:
+    """Dataclasses and paths as JSON values."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def provenance() -> dict[str, Any]:
+    """The command line and version to write beside an output."""
+    return {"command": shlex.join(["carstudio", *sys.argv[1:]]), "carstudio": __version__}

@@ -1,0 +1,77 @@
+"""`carstudio render`: a trained model and input photos -> turntables, opacity and depth."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from carstudio.commands.command import Outcome, Output
+from carstudio.dataset.store import PatchStore, open_store
+from carstudio.errors import InputError
+from carstudio.images import write_png
+from carstudio.report.panels import encode_patch, turntable
+from carstudio.report.video import write_gif, write_mp4
+from carstudio.training.checkpoint import load_model, pick_device
+
+
+@dataclass(frozen=True, kw_only=True)
+class Render(Output):
+    """Novel views of cars: encode one photo each, then go round the car."""
+
+    model: tyro.conf.Positional[Path]
+    """Folder of the run."""
+    data: Path
+    """The CarPatch3D store with the input photos."""
+    out: Path
+    """One folder per car: input.png, rgb/ opacity/ depth/, turntable.gif, turntable.mp4."""
+    patches: tuple[str, ...] = ()
+    """Patch ids to encode; the first view of --cars unseen cars when absent."""
+    cars: int = 4
+    """How many cars of the test part when no patch is named."""
+    split: str = "instance"
+    """Split whose test part the cars are taken from."""
+    views: int = 36
+    """Views around the car."""
+    size: int = 256
+    """Side of a view in px."""
+    elevation: float = 12.0
+    """Height angle of the camera in degrees."""
+    device: str = "auto"
+    """auto, cpu, cuda, mps, ..."""
+
+    def run(self) -> Outcome:
+        """Render and write."""
+        if self.views < 1 or not 8 <= self.size <= 4096:
+            raise InputError(f"--views must be at least 1 and --size 8 to 4096, found {self.views} and {self.size}")
+        model = load_model(self.model, device=pick_device(self.device))
+        store = open_store(self.data)
+        patch_ids = self.patches or tuple(self._first_views(store))
+        with self.progress() as report:
+            for done, patch_id in enumerate(patch_ids, start=1):
+                prepared, latents, box = encode_patch(model, store, patch_id)
+                frames = turntable(
+                    model, latents, box, views=self.views, size_px=self.size, elevation_deg=self.elevation
+                )
+                folder = self.out / patch_id
+                write_png(folder / "input.png", prepared.rgb.numpy())
+                for name in ("rgb", "opacity", "depth"):
+                    for i, frame in enumerate(getattr(frames, name)):
+                        write_png(folder / name / f"{i:03d}.png", frame)
+                rows = zip(frames.rgb, frames.opacity, frames.depth, strict=True)
+                joined = [np.concatenate(row, axis=1) for row in rows]
+                write_gif(folder / "turntable.gif", joined, fps=12)
+                write_mp4(folder / "turntable.mp4", joined, fps=12)
+                report("rendering", done, len(patch_ids), patch_id)
+        return Outcome(f"{len(patch_ids)} cars in {self.out}", {"cars": list(patch_ids), "out": str(self.out)})
+
+    def _first_views(self, store: PatchStore) -> list[str]:
+        ids = store.patch_ids(kept=True, split=self.split, part="test")
+        table = store.table(["patch_id", "instance_id"])
+        instance_of = dict(zip(table["patch_id"].to_pylist(), table["instance_id"].to_pylist(), strict=True))
+        first: dict[str, str] = {}
+        for patch_id in ids:
+            first.setdefault(instance_of[patch_id], patch_id)
+        if not first:
+            raise InputError(f"{self.data}: no kept patch in the test part of split {self.split!r}; name --patches")
+        return list(first.values())[: self.cars]

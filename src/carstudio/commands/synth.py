@@ -1,0 +1,18 @@
+"""`carstudio synth`: photographs of synthetic cars with exact truth, as a CarPatch3D store."""
+
+from dataclasses import dataclass
+
+from carstudio.commands.build import describe
+from carstudio.commands.command import Outcome, Output, plain
+from carstudio.dataset.sources.synthetic import SynthConfig, synthesize
+
+
+@dataclass(frozen=True, kw_only=True)
+class Synth(Output, SynthConfig):
+    """Photographs of synthetic cars (or of the GLB meshes in --meshes) with exact mask, depth, box and camera."""
+
+    def run(self) -> Outcome:
+        """Render and write the store."""
+        with self.progress() as report:
+            summary = synthesize(self, report)
+        return Outcome(describe(summary), plain(summary))

@@ -1,0 +1,83 @@
+"""`carstudio train`: recipe + store -> a trained model."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from carstudio.commands.command import Outcome, Output, plain, provenance
+from carstudio.dataset.store import PatchStore, open_store
+from carstudio.models.interface import CategoryModel
+from carstudio.recipes import recipe
+from carstudio.report.panels import views_panel
+from carstudio.training.batches import Supervision
+from carstudio.training.trainer import TrainConfig, train
+
+
+@dataclass(frozen=True, kw_only=True)
+class Train(Output):
+    """Train a category model on a CarPatch3D store."""
+
+    recipe: tyro.conf.Positional[str]
+    """car-nerf, car-nerf-no-mask, car-nerf-as-released or car-nerf-small."""
+    data: Path
+    """The CarPatch3D store."""
+    out: Path
+    """Folder of the run: model.safetensors, model.json, log.jsonl, pictures/."""
+    steps: int | None = None
+    """Length of the run in steps (the recipe's own when absent)."""
+    minutes: float | None = None
+    """Length of the run in minutes instead."""
+    device: str = "auto"
+    """auto, cpu, cuda, cuda:1, mps, ..."""
+    seed: int = 0
+    """Start of all randomness."""
+    resume: bool = False
+    """Go on with the run in --out."""
+    split: str | None = "instance"
+    """Split whose training part is used; "None" for all kept patches."""
+    supervision: Supervision | None = None
+    """Which photo an encoded photo must explain (the recipe's own when absent)."""
+    pictures: Annotated[int, tyro.conf.arg(metavar="N")] = 6
+    """Cars in the picture drawn at every checkpoint; 0: none."""
+
+    def config(self) -> TrainConfig:
+        """The recipe with this command's changes."""
+        config = replace(recipe(self.recipe), seed=self.seed, split=self.split, minutes=self.minutes)
+        if self.steps is not None:
+            config = replace(config, steps=self.steps)
+        if self.supervision is not None:
+            config = replace(config, supervision=self.supervision)
+        return config
+
+    def run(self) -> Outcome:
+        """Train; pictures of unseen cars go to OUT/pictures."""
+        store = open_store(self.data)
+
+        def draw(model: CategoryModel, step: int) -> None:
+            if self.pictures:
+                views_panel(model, store, self.out / "pictures" / f"step-{step:07d}.png", self.split, self.pictures)
+
+        with self.progress() as report:
+            summary = train(
+                self.config(),
+                store,
+                self.out,
+                device=self.device,
+                resume=self.resume,
+                provenance={**provenance(), **store_origin(store)},
+                report=report,
+                on_save=draw,
+            )
+        text = (
+            f"{self.recipe}: {summary.steps} steps in {summary.seconds:.0f} s ({summary.rays_per_s:,.0f} rays/s), "
+            f"encoder from {summary.encoder_start}; PSNR on the last batch's car pixels {summary.psnr:.2f} dB\n"
+            f"model in {self.out}"
+        )
+        return Outcome(text, plain(summary))
+
+
+def store_origin(store: PatchStore) -> dict[str, str]:
+    """What a model file says about its data."""
+    return {"data": store.path.name, "data_sha256": store.data_sha256}
