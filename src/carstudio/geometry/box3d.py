@@ -51,7 +51,7 @@ def box_from_kitti(
     bottom_center: Float[Tensor, "*batch 3"],
     size: Float[Tensor, "*batch 3"],
     yaw_rad: Float[Tensor, "*batch"],
-    camera_offset: Float[Tensor, "*batch 3"] | None = None,
+    camera_offset: Float[Tensor, "*#batch 3"] | None = None,
 ) -> Box3D:
     """Box of a KITTI label: `bottom_center` is the centre of the BOTTOM face in the label frame.
 

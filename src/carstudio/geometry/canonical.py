@@ -11,6 +11,8 @@ from torch import Tensor
 from carstudio.geometry.box3d import Box3D
 from carstudio.geometry.transforms import invert_rigid
 
+PARALLEL = 1e-10  # canonical units per metre: a ray of a kilometre drifts by 1e-7, less than a float resolves
+
 
 def canonical_from_car(size: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 4 4"]:
     """Car-Studio Eq. 1: diag(2/length, 2/height, 2/width, 1)."""
@@ -35,10 +37,13 @@ def ray_cube_interval(
     Directions need not be unit vectors: pass canonical images of metric rays and t stays metric. A camera inside the
     cube enters at t = 0. Where there is no interval both ends are 0. Rays that lie exactly in a face count as inside.
     """
-    inverse = 1.0 / torch.where(directions == 0, torch.full_like(directions, 1e-30), directions)
+    is_parallel = directions.abs() < PARALLEL
+    inverse = 1.0 / torch.where(is_parallel, torch.ones_like(directions), directions)
     t_a, t_b = (-1.0 - origins) * inverse, (1.0 - origins) * inverse
-    entry = torch.minimum(t_a, t_b).amax(dim=-1).clamp(min=0.0)
-    exit_ = torch.maximum(t_a, t_b).amin(dim=-1)
+    # Parallel to a pair of faces: between them (or in one) all the way, or never. Kept apart, since 0 * (1 / 0) is NaN.
+    always = torch.where(origins.abs() <= 1, torch.inf, -torch.inf)
+    entry = torch.where(is_parallel, -always, torch.minimum(t_a, t_b)).amax(dim=-1).clamp(min=0.0)
+    exit_ = torch.where(is_parallel, always, torch.maximum(t_a, t_b)).amin(dim=-1)
     hit = exit_ > entry
     zero = torch.zeros_like(entry)
     return torch.where(hit, entry, zero), torch.where(hit, exit_, zero), hit
