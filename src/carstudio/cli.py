@@ -9,6 +9,7 @@ from importlib import import_module
 import tyro
 
 from carstudio import __version__
+from carstudio.allocator import keep_freed_memory
 from carstudio.commands.command import Command
 from carstudio.errors import InputError
 
@@ -43,6 +44,7 @@ def run(arguments: list[str]) -> int:
     if verb not in VERBS:
         print(f"carstudio: no verb {verb!r}\n\n{usage()}", file=sys.stderr)
         return 2
+    keep_freed_memory()
     module, name = VERBS[verb][0].split(":")
     command: Command = tyro.cli(
         getattr(import_module(module), name),

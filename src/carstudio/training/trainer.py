@@ -119,7 +119,7 @@ class _Run:
         provenance: dict[str, Any],
     ) -> None:
         self.config, self.out, self.device, self.provenance = config, out, device, provenance
-        patch_ids = store.patch_ids(kept=True, split=config.split, part="train")
+        patch_ids = store.patch_ids(kept=True, split=config.split, part="train" if config.split else "all")
         if not patch_ids:
             raise InputError(f"{store.path}: no kept patch in the training part of split {config.split!r}")
         torch.manual_seed(config.seed)

@@ -1,0 +1,92 @@
+from collections import Counter
+
+import pytest
+import torch
+
+from carstudio.dataset.pixels import PatchCache, prepare_patch
+from carstudio.dataset.store import PatchStore
+from carstudio.training.batches import StepSampler, generator_for, pixel_batch
+from training.toy import SIDE_PX, toy_store
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> PatchStore:
+    return toy_store(tmp_path_factory.mktemp("toy") / "store")
+
+
+def sampler(store: PatchStore, supervision: str = "single-view", seed: int = 0) -> StepSampler:
+    cache = PatchCache(store, 32)
+    return StepSampler(cache, store.patch_ids(), patches_per_step=5, supervision=supervision, seed=seed)  # type: ignore[arg-type]
+
+
+def test_every_patch_is_encoded_once_per_epoch(store: PatchStore) -> None:
+    drawn = [patch_id for step in range(12) for patch_id in sampler(store).input_ids(step)]  # 60 = 5 epochs of 12
+    assert len(store.patch_ids()) == 12
+    for epoch in range(5):
+        assert Counter(drawn[12 * epoch : 12 * epoch + 12]) == Counter(store.patch_ids())
+    assert drawn[:12] != drawn[12:24]
+
+
+def test_a_step_is_the_same_whoever_asks_and_whenever(store: PatchStore) -> None:
+    walked, jumped = sampler(store), sampler(store)
+    for step in range(7):
+        walked.batch(step, 16)
+    a, b = walked.batch(7, 16), jumped.batch(7, 16)
+    assert a[0].instance_ids == b[0].instance_ids
+    assert torch.equal(a[1].rgb, b[1].rgb)
+    assert torch.equal(a[1].rays.directions, b[1].rays.directions)
+    assert not torch.equal(a[1].rgb, jumped.batch(8, 16)[1].rgb)
+
+
+def test_supervision_chooses_the_target(store: PatchStore) -> None:
+    single, multi, mixed = (sampler(store, kind) for kind in ("single-view", "multi-view", "mixed"))
+    same = 0
+    for step in range(40):
+        inputs = single.input_ids(step)
+        assert single.target_ids(step, inputs) == inputs
+        others = multi.target_ids(step, inputs)
+        assert all(a != b for a, b in zip(inputs, others, strict=True))
+        assert all(a.rsplit("-", 1)[0] == b.rsplit("-", 1)[0] for a, b in zip(inputs, others, strict=True))
+        same += sum(a == b for a, b in zip(inputs, mixed.target_ids(step, inputs), strict=True))
+    assert 70 <= same <= 130  # half of 200, four standard deviations
+
+
+def test_streams_and_steps_do_not_share_numbers() -> None:
+    draws = {
+        tuple(torch.rand(4, generator=generator_for(seed, step, stream)).tolist())
+        for seed in range(3)
+        for step in range(20)
+        for stream in ("epoch", "target", "pixels", "jitter")
+    }
+    assert len(draws) == 3 * 20 * 4
+
+
+def test_pixels_carry_the_colour_that_stands_there(store: PatchStore) -> None:
+    """Each drawn ray, projected back, must name a pixel whose colour and mask are the batch's."""
+    prepared = prepare_patch(store.patch("toy-1-2"), 32)
+    pixels = pixel_batch([prepared], 500, torch.Generator().manual_seed(0))
+    at = prepared.camera.project(pixels.rays.directions[0])
+    column, row = at[:, 0].floor().long(), at[:, 1].floor().long()
+    assert torch.allclose(at - at.floor(), torch.full_like(at, 0.5), atol=1e-3)
+    assert torch.allclose(pixels.rgb[0], prepared.rgb[row, column].float() / 255)
+    assert torch.equal(pixels.alpha[0] == 1, prepared.mask[row, column] == 255)
+    assert int(column.max()) > SIDE_PX * 3 // 4
+
+
+def test_more_rays_than_pixels_is_no_problem(store: PatchStore) -> None:
+    """Released code crashes when a patch has fewer pixels than rays."""
+    prepared = prepare_patch(store.patch("toy-0-0"), 32)
+    assert pixel_batch([prepared], 10_000, torch.Generator().manual_seed(0)).rgb.shape == (1, 10_000, 3)
+
+
+def test_the_cache_forgets_the_oldest_and_changes_nothing(store: PatchStore) -> None:
+    full, tight = PatchCache(store, 32), PatchCache(store, 32, max_bytes=20_000)
+    for patch_id in [*store.patch_ids(), *store.patch_ids()]:
+        assert torch.equal(full[patch_id].encoder_image, tight[patch_id].encoder_image)
+    assert len(tight._patches) < len(full._patches) == 12
+
+
+def test_encoder_camera_sees_the_resized_crop(store: PatchStore) -> None:
+    prepared = prepare_patch(store.patch("toy-0-1"), 80)  # twice the crop
+    corner = torch.tensor([[1.0, 0.5, 5.0]])
+    assert torch.allclose(prepared.encoder_camera.project(corner), 2 * prepared.camera.project(corner), atol=1e-4)

@@ -1,0 +1,160 @@
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from carstudio.dataset.store import PatchStore
+from carstudio.errors import InputError
+from carstudio.evaluation.protocols import EvaluationConfig, score_views, view_pairs
+from carstudio.models.car_nerf import CarNeRFConfig
+from carstudio.models.encoders import EncoderConfig
+from carstudio.models.interface import CategoryModel
+from carstudio.rendering.field import SamplingConfig
+from carstudio.training.checkpoint import describe_model, load_model
+from carstudio.training.log import read_log
+from carstudio.training.losses import LossConfig
+from carstudio.training.schedule import ScheduleConfig, learning_rate
+from carstudio.training.trainer import TrainConfig, train
+from training.toy import toy_store
+
+TINY = TrainConfig(
+    recipe="tiny",
+    model=CarNeRFConfig(
+        encoder=EncoderConfig(kind="small", side_px=32, pretrained=None, num_features=32, sees_mask=True),
+        sampling=SamplingConfig(coarse=16, fine=0),
+        width=32,
+        depth=3,
+        skip_after=None,
+        code_size=16,
+        position_frequencies=4,
+        direction_frequencies=1,
+        normalise_codes=True,
+        colour_skip_px=4,
+    ),
+    loss=LossConfig(colour="whole-crop"),
+    schedule=ScheduleConfig(first=1e-2, last=1e-3, decay_steps=None),
+    supervision="mixed",
+    patches_per_step=6,
+    rays_per_patch=64,
+    steps=12,
+    split=None,
+    log_every=2,
+    save_every=4,
+)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> PatchStore:
+    return toy_store(tmp_path_factory.mktemp("toy") / "store")
+
+
+def test_it_learns_the_toy_cars(store: PatchStore, tmp_path: Path) -> None:
+    """Shape and colours of three ellipsoids: silhouettes overlap well and novel views beat a grey car by far."""
+    train(dataclasses.replace(TINY, steps=300), store, tmp_path / "run", device="cpu")
+    model = load_model(tmp_path / "run")
+    pairs = view_pairs(store, EvaluationConfig(protocol="novel-view", split=None))
+    views = list(score_views(model, store, pairs))
+    iou = sum(view.scores.mask_iou or 0 for view in views) / len(views)
+    psnr = sum(view.scores.psnr or 0 for view in views) / len(views)
+    assert len(views) == 12
+    assert iou > 0.85, iou
+    assert psnr > 17.0, psnr  # a grey ellipsoid of the right shape scores about 13
+    for view in views:
+        assert view.pair.input_patch_id != view.pair.scored_patch_id
+
+
+class KilledError(Exception):
+    """Stands for SIGKILL right after a checkpoint."""
+
+
+def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(store: PatchStore, tmp_path: Path) -> None:
+    def kill(model: CategoryModel, step: int) -> None:
+        if step == 8:
+            raise KilledError
+
+    torch.set_num_threads(1)
+    train(TINY, store, tmp_path / "whole", device="cpu")
+    with pytest.raises(KilledError):
+        train(TINY, store, tmp_path / "parts", device="cpu", on_save=kill)
+    with (tmp_path / "parts" / "log.jsonl").open("a") as log:
+        log.write('{"step": 10, "loss": 1.0}\n{"step": 11, "lo')  # what a kill between checkpoints leaves
+    train(TINY, store, tmp_path / "parts", device="cpu", resume=True)
+    for name in ("model.safetensors", "log.jsonl"):
+        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "parts" / name).read_bytes(), name
+    assert [row["step"] for row in read_log(tmp_path / "parts" / "log.jsonl")] == [2, 4, 6, 8, 10, 12]
+
+
+def test_a_second_run_does_not_overwrite_the_first(store: PatchStore, tmp_path: Path) -> None:
+    train(TINY, store, tmp_path, device="cpu")
+    with pytest.raises(InputError, match="--resume"):
+        train(TINY, store, tmp_path, device="cpu")
+    with pytest.raises(InputError, match="nothing to resume"):
+        train(TINY, store, tmp_path / "empty", device="cpu", resume=True)
+
+
+def test_nan_stops_with_step_cars_and_term(store: PatchStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import carstudio.training.trainer as trainer
+
+    real = trainer.training_loss
+
+    def poisoned(*arguments: object) -> dict[str, torch.Tensor]:
+        terms = real(*arguments)  # type: ignore[arg-type]
+        return {**terms, "mask_fine": terms["mask_fine"] * math.nan}
+
+    monkeypatch.setattr(trainer, "training_loss", poisoned)
+    with pytest.raises(FloatingPointError, match=r"step 0: loss term mask_fine is nan for cars \['toy-"):
+        train(TINY, store, tmp_path, device="cpu")
+
+
+def test_the_model_file_says_where_it_comes_from(store: PatchStore, tmp_path: Path) -> None:
+    summary = train(TINY, store, tmp_path, device="cpu", provenance={"data_sha256": store.data_sha256})
+    description = describe_model(tmp_path)
+    assert description.config == TINY.model
+    assert description.provenance["recipe"] == "tiny"
+    assert description.provenance["step"] == summary.steps == 12
+    assert description.provenance["data_sha256"] == store.data_sha256
+    assert description.sha256 == summary.sha256
+
+
+def test_broken_models_are_refused_with_a_reason(store: PatchStore, tmp_path: Path) -> None:
+    train(TINY, store, tmp_path, device="cpu")
+    weights, description = tmp_path / "model.safetensors", tmp_path / "model.json"
+    good, text = weights.read_bytes(), description.read_text()
+
+    weights.write_bytes(good[: len(good) // 2])
+    with pytest.raises(InputError, match="not a whole safetensors"):
+        load_model(tmp_path)
+    weights.write_bytes(good[:-4] + b"\x00\x00\x80\x3f")
+    with pytest.raises(InputError, match="sha256"):
+        load_model(tmp_path)
+    weights.write_bytes(good)
+
+    value = json.loads(text)
+    for change, message in (
+        ({"format_version": 99}, "format_version 1, found 99"),
+        ({"config": {**value["config"], "kind": "other"}}, "model kind"),
+        ({"config": {**value["config"], "wings": 2}}, "unknown fields"),
+        ({"config": {**value["config"], "width": "wide"}}, "'width'"),
+        ({"config": {**value["config"], "width": 48}}, "shape"),
+    ):
+        description.write_text(json.dumps({**value, **change}))
+        with pytest.raises(InputError, match=message):
+            load_model(tmp_path)
+    description.unlink()
+    with pytest.raises(InputError, match="expected a trained model"):
+        load_model(tmp_path)
+
+
+def test_schedules() -> None:
+    paper = ScheduleConfig()
+    assert learning_rate(paper, 0, 0.0) == pytest.approx(1e-3)
+    assert learning_rate(paper, 100_000, 0.2) == pytest.approx(math.sqrt(1e-3 * 1e-4))
+    assert learning_rate(paper, 200_000, 0.4) == pytest.approx(1e-4)
+    assert learning_rate(paper, 500_000, 1.0) == pytest.approx(1e-4)
+    small = ScheduleConfig(first=2e-3, last=2e-4, decay_steps=None, warmup_steps=10)
+    assert learning_rate(small, 0, 0.0) == pytest.approx(2e-4)
+    assert learning_rate(small, 9, 0.0) == pytest.approx(2e-3)
+    assert learning_rate(small, 500, 0.5) == pytest.approx(math.sqrt(2e-3 * 2e-4))
