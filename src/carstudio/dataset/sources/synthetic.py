@@ -1,0 +1,230 @@
+"""`carstudio synth`: photographs of synthetic cars (or of GLB meshes) as a CarPatch3D store with exact truth.
+
+Each car is worked on by itself, from (seed, index of the car) alone, so the number of processes changes nothing, and a
+run that was cut off goes on after its whole shards.
+"""
+
+import hashlib
+import json
+import multiprocessing
+import os
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+import torch
+
+from carstudio.dataset.build import judge_store, summarize
+from carstudio.dataset.candidates import crop_window
+from carstudio.dataset.filters import FilterRecipe
+from carstudio.dataset.patch import MaskValue, PatchRecord
+from carstudio.dataset.runs import write_run
+from carstudio.dataset.store import StoreWriter, open_store
+from carstudio.dataset.summary import BuildSummary
+from carstudio.errors import InputError
+from carstudio.geometry.box3d import envelope
+from carstudio.geometry.overlap import box2d_iou
+from carstudio.geometry.transforms import quaternion_from_rotation
+from carstudio.images import encode_depth, encode_png
+from carstudio.progress import Report, silent
+from carstudio.synthetic.cameras import CameraKind
+from carstudio.synthetic.cars import Car, draw_car
+from carstudio.synthetic.glb import load_glb
+from carstudio.synthetic.photographs import Photograph, draw_photographs
+
+__all__ = ["BuildSummary", "SynthConfig", "synthesize"]
+
+SOURCE = "synthetic"
+MIN_SIZE_PX, MAX_SIZE_PX = 16, 4096
+# Truth is exact, so nothing is rejected; the filters still write down what they measure.
+KEEP_ALL = FilterRecipe(height_px=0, width_px=0, depth_m=1000, score_mask=0, mask_ratio=0, box_iou=0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SynthConfig:
+    """What to photograph and how."""
+
+    out: Path
+    """Folder of the store; must be new, empty or an unfinished store."""
+    cars: int = 200
+    """Number of cars; with --meshes the files are taken in turn, each time in another street and light."""
+    views: int = 12
+    """Photos of each car, from all around it."""
+    size: int = 128
+    """Width and height of a photo, px; the car fills 70 to 95 % of it."""
+    meshes: Path | None = None
+    """A GLB file or a folder of them (glTF axes: +Y up, +Z front; metres) instead of generated cars."""
+    cameras: CameraKind = "mixed"
+    """kitti: level, 1.65 m high, 6 to 22 m away; phone: pitched down by 5 to 15 degrees, nearer; mixed: both."""
+    renderer: Literal["embree"] = "embree"
+    """Ray caster."""
+    seed: int = 0
+    """The same seed gives the same cars and photos."""
+    licence: str | None = None
+    """SPDX name put on the patches; CC0-1.0 for generated cars when absent, "unknown" for meshes."""
+    workers: int = 0
+    """Processes; 0 takes one per core. Changes nothing in the result."""
+
+
+def synthesize(config: SynthConfig, report: Report = silent) -> BuildSummary:
+    """Make the store `config.out`: every photo is kept; the splits are written."""
+    start = time.perf_counter()
+    _check(config)
+    files = mesh_files(config.meshes)
+    with StoreWriter(config.out, source=SOURCE, resume_key=_resume_key(config, files)) as writer:
+        write_run(config.out, asdict(config))
+        todo = [i for i in range(config.cars) if not all(writer.has(name) for name in patch_ids(config, i))]
+        for done, records in enumerate(_run(config, files, todo), start=1 + config.cars - len(todo)):
+            for record in records:
+                if not writer.has(record.patch_id):
+                    writer.append(record)
+            report("photograph", done, config.cars, f"{len(writer)} photos")
+    store = open_store(config.out)
+    summary = summarize(store, source=SOURCE, verdicts=judge_store(store, KEEP_ALL))
+    return replace(summary, seconds=time.perf_counter() - start)
+
+
+def _check(config: SynthConfig) -> None:
+    for name, low in (("cars", 1), ("views", 1), ("seed", 0), ("workers", 0)):
+        if getattr(config, name) < low:
+            raise InputError(f"--{name} must be {low} or more, found {getattr(config, name)}")
+    if not MIN_SIZE_PX <= config.size <= MAX_SIZE_PX:
+        raise InputError(f"--size must be {MIN_SIZE_PX} to {MAX_SIZE_PX} px, found {config.size}")
+
+
+def mesh_files(meshes: Path | None) -> list[Path]:
+    """The GLB files that --meshes names; none without it."""
+    if meshes is None:
+        return []
+    files = [meshes] if meshes.is_file() else sorted(meshes.glob("*.glb"))
+    if not files:
+        raise InputError(f"--meshes {meshes}: expected a GLB file or a folder with *.glb, found none")
+    for file in files:
+        load_glb(file)  # a broken file is told at once, not after minutes
+    return files
+
+
+def _resume_key(config: SynthConfig, files: list[Path]) -> str:
+    """What must be equal for an interrupted run to go on; more cars may be asked for than before."""
+    settings = {k: v for k, v in asdict(config).items() if k not in ("out", "workers", "meshes", "cars")}
+    settings["meshes"] = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
+    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
+
+
+def _run(config: SynthConfig, files: list[Path], todo: list[int]) -> Iterator[tuple[PatchRecord, ...]]:
+    """Records car by car, in order."""
+    workers = min(config.workers or os.cpu_count() or 1, max(1, len(todo) // 4))  # a process takes seconds to start
+    work = partial(car_records, config, files)
+    if workers == 1:
+        yield from map(work, todo)
+        return
+    context = multiprocessing.get_context("spawn")  # torch has threads: forking them is not safe
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_one_thread) as pool:
+        yield from pool.map(work, todo)
+
+
+def _one_thread() -> None:
+    """One process per core, one thread per process."""
+    cv2.setNumThreads(1)
+    torch.set_num_threads(1)
+
+
+def patch_ids(config: SynthConfig, index: int) -> list[str]:
+    """Ids of a car's patches."""
+    return [f"{instance_id(config, index)}-{view:03d}" for view in range(config.views)]
+
+
+def instance_id(config: SynthConfig, index: int) -> str:
+    """Id of a car."""
+    return f"syn-{config.seed}-{index:06d}"
+
+
+def make_car(config: SynthConfig, files: list[Path], index: int) -> Car:
+    """The car of an index: drawn, or the mesh whose turn it is."""
+    if files:
+        return load_glb(files[index % len(files)])
+    return draw_car(np.random.default_rng([config.seed, index]))
+
+
+def car_records(config: SynthConfig, files: list[Path], index: int) -> tuple[PatchRecord, ...]:
+    """All patches of one car."""
+    car = make_car(config, files, index)
+    photographs = draw_photographs(
+        car, seed=(config.seed, index), num_views=config.views, size_px=config.size, cameras=config.cameras
+    )
+    return tuple(_record(config, car, index, view, photo) for view, photo in enumerate(photographs))
+
+
+def _record(config: SynthConfig, car: Car, index: int, view: int, photo: Photograph) -> PatchRecord:
+    rows, columns = np.nonzero(photo.mask)
+    box2d = (float(columns.min()), float(rows.min()), float(columns.max() + 1), float(rows.max() + 1))
+    window = crop_window(box2d, config.size, config.size)
+    camera, box = photo.viewpoint.camera, photo.viewpoint.box(car.mesh)
+    outline = envelope(box, camera)
+    assert outline is not None
+    image = encode_png(np.ascontiguousarray(photo.image[window.slices]))
+    mask = np.where(photo.mask, MaskValue.CAR, MaskValue.BACKGROUND).astype(np.uint8)[window.slices]
+    fx, fy, cx, cy = camera.intrinsics.tolist()
+    is_upright = photo.viewpoint.kind == "kitti"
+    rotation = quaternion_from_rotation(torch.tensor(photo.viewpoint.rotation, dtype=torch.float64))
+    patch_id = patch_ids(config, index)[view]
+    return PatchRecord(
+        patch_id=patch_id,
+        instance_id=instance_id(config, index),
+        frame_id=patch_id,
+        sequence_id=instance_id(config, index),
+        frame_index=view,
+        source=SOURCE,
+        image=image,
+        mask=encode_png(np.ascontiguousarray(mask)),
+        depth=encode_depth(photo.depth_m[window.slices]),
+        frame_path=f"synthetic/{patch_id}",
+        frame_width=config.size,
+        frame_height=config.size,
+        crop_x0=window.x0,
+        crop_y0=window.y0,
+        crop_width=window.width,
+        crop_height=window.height,
+        fx=fx,
+        fy=fy,
+        cx=cx,
+        cy=cy,
+        camera_source="exact",
+        box2d=box2d,
+        box_center=tuple(photo.viewpoint.translation.tolist()),
+        box_size=tuple(car.mesh.size.tolist()),
+        box_yaw=float(box.yaw_rad),
+        box_rotation=None if is_upright else tuple(rotation.tolist()),
+        score_2d=1.0,
+        score_mask=1.0,
+        score_3d=1.0,
+        mask_ratio=float((mask == MaskValue.CAR).mean()),
+        box_iou=round(float(box2d_iou(outline, torch.tensor(box2d))), 6),
+        truncation=0.0,
+        occlusion=0,
+        licence=config.licence or ("unknown" if config.meshes else "CC0-1.0"),
+        sha256=hashlib.sha256(image).hexdigest(),
+        extra=_extra(config, car, photo),
+    )
+
+
+def _extra(config: SynthConfig, car: Car, photo: Photograph) -> str:
+    view, light = photo.viewpoint, photo.light
+    facts = {
+        "style": car.style,
+        "paint": None if car.paint is None else car.paint.name,
+        "paint_srgb": None if car.paint is None else list(car.paint.srgb),
+        "azimuth_deg": round(float(np.degrees(view.azimuth_rad)), 3),
+        "elevation_deg": round(float(np.degrees(view.elevation_rad)), 3),
+        "camera": view.kind,
+        "is_sunny": light.is_sunny,
+        "to_sun": [round(float(v), 4) for v in light.to_sun],
+        "seed": config.seed,
+    }
+    return json.dumps(facts, sort_keys=True)
