@@ -16,16 +16,16 @@ from carstudio.geometry.orbit import orbit_box, orbit_camera, orbit_distance
 from carstudio.images import to_uint8, write_png
 from carstudio.models.interface import CategoryModel, Latents, render_image
 from carstudio.report.colours import colour_depth, turbo
-from carstudio.report.sheets import Picture, side_by_side, view_pictures
+from carstudio.report.sheets import Pixels, side_by_side, view_pictures
 from carstudio.training.batches import patch_batch
 
 
-def truth_on_black(patch: PreparedPatch) -> Picture:
+def truth_on_black(patch: PreparedPatch) -> Pixels:
     """What a rendering is compared with: the car's pixels, black elsewhere."""
     return np.where((patch.mask == MaskValue.CAR).numpy()[..., None], patch.rgb.numpy(), 0).astype(np.uint8)
 
 
-def views_sheet(views: Sequence[ScoredView], *, tile_px: tuple[int, int] = (192, 128)) -> Picture:
+def views_sheet(views: Sequence[ScoredView], *, tile_px: tuple[int, int] = (192, 128)) -> Pixels:
     """One row per scored view, with its scores below."""
     rows = [
         view_pictures(
@@ -65,9 +65,9 @@ def _has_pairs(store: PatchStore, split: str | None, part: str) -> bool:
 class Turntable:
     """Frames of a car turning: colour on a background, opacity in Turbo, depth."""
 
-    rgb: list[Picture]
-    opacity: list[Picture]
-    depth: list[Picture]
+    rgb: list[Pixels]
+    opacity: list[Pixels]
+    depth: list[Pixels]
 
 
 def turntable(
