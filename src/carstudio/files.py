@@ -75,7 +75,7 @@ def sha256_file(path: Path | str) -> str:
 def inside(folder: Path | str, name: str) -> Path:
     """`folder / name`, refused when a name taken from a data file climbs out of the folder."""
     folder = Path(folder).resolve()
-    path = (folder / name).resolve()
-    if not path.is_relative_to(folder):
+    path = (folder / name).resolve() if "\0" not in name else None
+    if path is None or not path.is_relative_to(folder):
         raise InputError(f"path {name!r} leaves its folder {folder}; expected a path below it")
     return path

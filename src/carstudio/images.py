@@ -4,17 +4,29 @@ Arrays are numpy, (height, width[, channels]). Depth images follow KITTI: value 
 """
 
 import io
+import struct
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import Image, UnidentifiedImageError
 
 from carstudio.errors import InputError
 from carstudio.files import write_bytes
 
 MAX_IMAGE_PIXELS = 120_000_000  # 12,000 x 10,000: larger than any camera's photo, small enough for a laptop's memory
 DEPTH_STEPS_PER_METRE = 256.0  # KITTI's depth PNG
+BROKEN = (OSError, ValueError, SyntaxError, EOFError)  # what Pillow raises on damaged files
+TURNS = {  # EXIF orientation -> what turns the stored pixels upright; 1 (and anything unknown) is upright
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+SIDEWAYS = {TURNS[orientation] for orientation in (5, 6, 7, 8)}
 
 
 def decode_image(data: bytes, *, name: str, mode: str = "RGB") -> UInt8[np.ndarray, "height width *channels"]:
@@ -23,12 +35,14 @@ def decode_image(data: bytes, *, name: str, mode: str = "RGB") -> UInt8[np.ndarr
     Raises `InputError` naming `name` when the bytes are not a whole image or exceed `MAX_IMAGE_PIXELS`.
     """
     image = _open(data, name)
+    turn = _upright_turn(image)
     try:
-        image = ImageOps.exif_transpose(image)
+        if turn is not None:
+            image = image.transpose(turn)
         if mode == "RGB" and image.mode in ("I;16", "I;16B", "I"):
             image = Image.fromarray((np.asarray(image).astype(np.uint32) >> 8).clip(0, 255).astype(np.uint8))
         return np.array(image.convert(mode))
-    except (OSError, ValueError, SyntaxError, EOFError) as error:
+    except BROKEN as error:
         raise InputError(f"{name}: image is broken or truncated ({error}); replace or remove the file") from error
 
 
@@ -48,9 +62,19 @@ def _open(data: bytes, name: str) -> Image.Image:
     return image
 
 
+def _upright_turn(image: Image.Image) -> Image.Transpose | None:
+    """What turns the stored pixels upright by their EXIF orientation; broken EXIF counts as none."""
+    try:
+        return TURNS.get(image.getexif().get(0x0112, 1))
+    except (*BROKEN, struct.error, KeyError, IndexError, TypeError):
+        return None
+
+
 def image_size(data: bytes, *, name: str) -> tuple[int, int]:
-    """(width, height) without decoding the pixels."""
-    return _open(data, name).size
+    """(width, height) as `decode_image` gives it, EXIF orientation applied, without decoding the pixels."""
+    image = _open(data, name)
+    width, height = image.size
+    return (height, width) if _upright_turn(image) in SIDEWAYS else (width, height)
 
 
 def read_image(path: Path | str, *, mode: str = "RGB") -> UInt8[np.ndarray, "height width *channels"]:
@@ -91,7 +115,13 @@ def encode_depth(depth_m: Float[np.ndarray, "height width"]) -> bytes:
 
 def decode_depth(data: bytes, *, name: str) -> Float[np.ndarray, "height width"]:
     """Metres, NaN where there is no depth."""
-    steps = np.array(_open(data, name)).astype(np.float32)
+    image = _open(data, name)
+    if image.mode not in ("I;16", "I;16B", "I"):  # older Pillow opens 16-bit PNG as "I"
+        raise InputError(f"{name}: expected a 16-bit grey depth image, found mode {image.mode}")
+    try:
+        steps = np.array(image).astype(np.float32)
+    except BROKEN as error:
+        raise InputError(f"{name}: depth image is broken or truncated ({error}); replace or remove the file") from error
     return np.where(steps > 0, steps / DEPTH_STEPS_PER_METRE, np.nan).astype(np.float32)
 
 
