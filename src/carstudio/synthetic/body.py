@@ -48,7 +48,9 @@ def end_profile(share: Float[np.ndarray, "*n"], *, top_m: float, bottom_m: float
 def wall_points(style: Style, share: Float[np.ndarray, " rows"]) -> Float[np.ndarray, "n rows 3"]:
     """Points of the wall at shares 0 (sill) to 1 (shoulder) of its height."""
     length, _, width = style.size
-    outline = half_outline(RINGS, front_exponent=style.corner, rear_exponent=style.corner + 0.8, aspect=length / width)
+    outline = half_outline(
+        RINGS, front_exponent=style.corner + 0.4, rear_exponent=style.corner + 1.4, aspect=length / width
+    )
     nose = 0.06 if style.bed else 0.14 if style.name in ("van", "suv") else 0.19
     tail = 0.05 if style.bed else 0.06 if style.name in ("van", "suv", "hatchback", "estate") else 0.12
     front = length / 2 - end_profile(share, top_m=nose, bottom_m=0.07)

@@ -79,7 +79,7 @@ def _paint_front(finish: UInt8[np.ndarray, "rows columns"], points: Points, dept
     fog = (np.hypot(z - 0.72 * half, h - style.clearance - 0.17) < 0.055) & (back < 0.5)
     finish[is_front & fog] = Finish.HEADLAMP
     finish[lamp] = Finish.HEADLAMP
-    finish[lamp & (back > 0.27)] = Finish.INDICATOR
+    finish[lamp & (back > 0.36)] = Finish.INDICATOR
     finish[lamp & ((depth < top + 0.012) | (np.abs(z - 0.52 * half) < 0.012))] = Finish.GLOSS_BLACK
     _paint_plate(finish, is_front & (back < 0.3), z, h - (style.clearance + 0.30), Finish.FRONT_PLATE)
 
@@ -102,7 +102,9 @@ def _paint_rear(finish: UInt8[np.ndarray, "rows columns"], points: Points, depth
     is_band = np.abs(depth - middle) < 0.028
     finish[lamp & is_band & (z < 0.90 * half) & (back < 0.2)] = Finish.REVERSE_LAMP
     finish[lamp & (np.abs(depth - middle) >= 0.028) & (np.abs(depth - middle) < 0.036)] = Finish.GLOSS_BLACK
-    finish[is_rear & (h < style.clearance + 0.16) & (h > style.clearance + 0.13) & (z > 0.62 * half)] = Finish.TAILLAMP
+    finish[is_rear & (h < style.clearance + 0.16) & (h > style.clearance + 0.13) & (np.abs(z - 0.70 * half) < 0.07)] = (
+        Finish.TAILLAMP
+    )
     plate_height = style.clearance + 0.20 if style.name in ("coupe", "pickup") else None
     middle_h = (h - plate_height) if plate_height is not None else 0.27 - depth
     _paint_plate(finish, is_rear & (back < 0.3), z, middle_h, Finish.REAR_PLATE)

@@ -1,4 +1,4 @@
-"""Small parts set onto the body: mirrors, roof rails, wipers' shadow gap left to the paint."""
+"""Small parts set onto the body: mirrors and roof rails."""
 
 import numpy as np
 from jaxtyping import Float
@@ -10,7 +10,7 @@ from carstudio.synthetic.outline import shoulder_line, station
 from carstudio.synthetic.styles import Style
 from carstudio.synthetic.surfaces import Part, both_sides, grid_part
 
-MIRROR_OVERHANG_M = 0.06  # beyond the body's widest point
+MIRROR_OVERHANG_M = 0.04  # beyond the body's widest point
 
 
 def detail_parts(style: Style, rng: np.random.Generator) -> list[Part]:

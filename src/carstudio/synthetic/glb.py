@@ -14,6 +14,7 @@ from carstudio.synthetic.surfaces import NO_CHART, CarMesh, Chart
 
 CAR_FROM_GLTF = np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]])  # front +Z, up +Y, left +X; a rotation
 MAX_EDGE_M = 0.25  # sky light is worked out per vertex
+INSIDE = 0.012  # linear grey seen through clear texels
 LENGTHS_M = (2.0, 9.0)  # what a car's length may be; anything else is in other units or along another axis
 
 
@@ -83,7 +84,10 @@ def _look(geometry: trimesh.Trimesh) -> tuple[Chart | None, Material]:
     image = getattr(material, "baseColorTexture", None)
     chart = None
     if image is not None and getattr(geometry.visual, "uv", None) is not None:
-        texels = linear_from_srgb(np.asarray(image.convert("RGB"), float) / 255) * rgb
+        rgba = np.asarray(image.convert("RGBA"), float) / 255
+        texels = linear_from_srgb(rgba[..., :3]) * rgb
+        if getattr(material, "alphaMode", None) in ("BLEND", "MASK"):  # windows: one sees the dark inside
+            texels = texels * rgba[..., 3:] + INSIDE * (1 - rgba[..., 3:])
         chart = Chart(rgb=np.ascontiguousarray(texels[::-1].transpose(1, 0, 2)).astype(np.float32))
     return chart, Material((r, g, b), 0.04, gloss)
 

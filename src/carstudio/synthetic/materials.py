@@ -98,7 +98,7 @@ def draw_paint(rng: np.random.Generator) -> Paint:
     """A paint by its share, its colour varied by a few per cent."""
     shares = np.array([paint.share for paint in PAINTS])
     paint = PAINTS[int(rng.choice(len(PAINTS), p=shares / shares.sum()))]
-    r, g, b = np.clip(np.array(paint.srgb) * rng.uniform(0.92, 1.08, 3) * rng.uniform(0.93, 1.04), 4, 250).round()
+    r, g, b = np.clip(np.array(paint.srgb) * rng.uniform(0.97, 1.03, 3) * rng.uniform(0.93, 1.05), 4, 250).round()
     return Paint(paint.name, (int(r), int(g), int(b)), paint.share, paint.metallic)
 
 

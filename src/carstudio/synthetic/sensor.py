@@ -31,7 +31,7 @@ class Sensor:
 def draw_sensor(rng: np.random.Generator) -> Sensor:
     """A plausible camera: KITTI's is dark, noisy and hard in contrast, a phone's bright and clean."""
     return Sensor(
-        brightness=float(rng.uniform(0.12, 0.26)),
+        brightness=float(np.exp(rng.uniform(np.log(0.08), np.log(0.25)))),
         gains=1 + rng.normal(0, 0.03, 3),
         blur_px=float(rng.uniform(0.0, 0.6)),
         shot_noise=float(rng.uniform(0.004, 0.02)),

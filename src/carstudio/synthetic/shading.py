@@ -49,7 +49,7 @@ def shade(scene: Scene, origins: Vectors, directions: Vectors) -> Colours:
     return rgb
 
 
-def _shade_car(scene: Scene, hits: Hits, origins: Vectors, directions: Vectors) -> Colours:
+def _shade_car(scene: Scene, hits: Hits, origins: Vectors, directions: Vectors) -> Float[np.ndarray, "hit 3"]:
     surface = scene.tracer.surface(hits)
     view = directions[hits.ray]
     points = origins[hits.ray] + hits.distance[:, None] * view

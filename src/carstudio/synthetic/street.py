@@ -39,9 +39,13 @@ class Street:
         return cos * points[:, 0] + sin * points[:, 2], cos * points[:, 2] - sin * points[:, 0]
 
     def noise_at(self, a: np.ndarray, b: np.ndarray, cell_m: float) -> np.ndarray:
-        """Smooth noise in [0, 1] with details of a few `cell_m`, nearest sample."""
-        i = np.floor(a / cell_m).astype(int) & 255
-        return self.noise[i, np.floor(b / cell_m).astype(int) & 255]
+        """Smooth noise in [0, 1] with details of a few `cell_m`, bilinear."""
+        x, y = a / cell_m, b / cell_m
+        i, j = np.floor(x).astype(int), np.floor(y).astype(int)
+        u, v = x - i, y - j
+        i0, i1, j0, j1 = i & 255, (i + 1) & 255, j & 255, (j + 1) & 255
+        low = self.noise[i0, j0] * (1 - v) + self.noise[i0, j1] * v
+        return low * (1 - u) + (self.noise[i1, j0] * (1 - v) + self.noise[i1, j1] * v) * u
 
     def ground_colour(self, points: Float[np.ndarray, "n 3"]) -> Colours:
         """Reflectance of the ground."""
@@ -55,7 +59,7 @@ class Street:
         slab = np.where((s % 0.5 < 0.02) | (off % 0.5 < 0.02), 0.6, 1.0)
         rgb = np.where((off >= self.half_width)[:, None], self.pavement * (grain * slab)[:, None], rgb)
         rgb = np.where(is_kerb[:, None], 0.36 * grain[:, None], rgb)
-        grass = np.array([0.07, 0.11, 0.035]) * (0.5 + grain[:, None])
+        grass = np.array([0.075, 0.095, 0.04]) * (0.5 + grain[:, None])
         return np.where((off > self.half_width + 2.6)[:, None], grass, rgb).astype(np.float32)
 
     def facade(self, row: int, s: np.ndarray, up: np.ndarray) -> tuple[Colours, np.ndarray]:
@@ -69,7 +73,7 @@ class Street:
         shade = 0.85 + 0.3 * self.noise_at(s, up, 0.2)
         house = np.where(is_window[:, None], 0.05, rgb * shade[:, None])
         tree = rgb * (0.15 + 1.5 * leaves[:, None])
-        top = np.where(green, height * (0.72 + 0.5 * self.noise_at(s, s * 0, 0.25)), height)
+        top = np.where(green, height * (0.72 + 0.5 * self.noise_at(s, s * 0, 0.5)), height)
         return np.where(green[:, None], tree, house).astype(np.float32), up < top
 
 
@@ -93,7 +97,7 @@ def draw_street(rng: np.random.Generator, ground_y: float) -> Street:
         wall=np.where(is_green[..., None] > 0.5, leaf, wall),
         height=height,
         is_green=is_green,
-        noise=tileable_noise(rng),
+        noise=tileable_noise(rng).astype(np.float32),
     )
 
 

@@ -83,7 +83,7 @@ class CarMesh:
 def grid_part(
     points: Float[np.ndarray, "rows columns 3"],
     *,
-    outside: Float[np.ndarray, "3"] | None = None,
+    outside: Float[np.ndarray, "*#grid 3"] | None = None,
     material: int = 0,
     painter: Painter | None = None,
     texels: tuple[int, int] = (512, 128),
@@ -103,6 +103,9 @@ def grid_part(
     is_inward = float((normals * reference).sum()) < 0
     if is_inward:
         normals = -normals
+    is_point = np.linalg.norm(normals, axis=-1, keepdims=True) < 0.5  # the grid closes to a point there
+    away = reference / np.maximum(np.linalg.norm(reference, axis=-1, keepdims=True), 1e-9)
+    normals = np.where(is_point, away, normals)
     if seam_z:
         for row in (0, -1):
             normals[row, :, 2] = 0

@@ -9,7 +9,7 @@ import json
 import multiprocessing
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -33,17 +33,18 @@ from carstudio.geometry.overlap import box2d_iou
 from carstudio.geometry.transforms import quaternion_from_rotation
 from carstudio.images import encode_depth, encode_png
 from carstudio.progress import Report, silent
+from carstudio.synthetic.benchmark import BENCHMARK_CARS, BENCHMARK_SEED, BENCHMARK_SIZE_PX, BENCHMARK_VIEWS
 from carstudio.synthetic.cameras import CameraKind
 from carstudio.synthetic.cars import Car, draw_car
 from carstudio.synthetic.glb import load_glb
 from carstudio.synthetic.photographs import Photograph, draw_photographs
 
-__all__ = ["BuildSummary", "SynthConfig", "synthesize"]
+__all__ = ["BuildSummary", "SynthConfig", "frozen_benchmark", "synthesize"]
 
 SOURCE = "synthetic"
 MIN_SIZE_PX, MAX_SIZE_PX = 16, 4096
 # Truth is exact, so nothing is rejected; the filters still write down what they measure.
-KEEP_ALL = FilterRecipe(height_px=0, width_px=0, depth_m=1000, score_mask=0, mask_ratio=0, box_iou=0)
+KEEP_ALL = FilterRecipe(height_px=0.0, width_px=0.0, depth_m=1000.0, score_mask=0.0, mask_ratio=0.0, box_iou=0.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,6 +73,18 @@ class SynthConfig:
     """Processes; 0 takes one per core. Changes nothing in the result."""
 
 
+def frozen_benchmark(out: Path, workers: int = 0) -> SynthConfig:
+    """The frozen benchmark set (synthetic/benchmark.py): 64 cars x 8 views, 128 x 128 px, never trained on."""
+    return SynthConfig(
+        out=out,
+        cars=BENCHMARK_CARS,
+        views=BENCHMARK_VIEWS,
+        size=BENCHMARK_SIZE_PX,
+        seed=BENCHMARK_SEED,
+        workers=workers,
+    )
+
+
 def synthesize(config: SynthConfig, report: Report = silent) -> BuildSummary:
     """Make the store `config.out`: every photo is kept; the splits are written."""
     start = time.perf_counter()
@@ -88,6 +101,39 @@ def synthesize(config: SynthConfig, report: Report = silent) -> BuildSummary:
     store = open_store(config.out)
     summary = summarize(store, source=SOURCE, verdicts=judge_store(store, KEEP_ALL))
     return replace(summary, seconds=time.perf_counter() - start)
+
+
+def content_digest(records: Iterable[PatchRecord]) -> str:
+    """Sha256 (hexadecimal) over decoded pixels and labels in order: encoders of PNG do not matter."""
+    digest = hashlib.sha256()
+    for record in records:
+        patch = record.decode()
+        assert patch.depth_m is not None
+        for pixels in (patch.image, patch.mask, np.nan_to_num(patch.depth_m)):
+            digest.update(np.ascontiguousarray(pixels).tobytes())
+        window = (record.crop_x0, record.crop_y0, record.crop_width, record.crop_height)
+        camera = (record.fx, record.fy, record.cx, record.cy)
+        box = (record.box_center, record.box_size, record.box_yaw, record.box_rotation)
+        digest.update(json.dumps([record.patch_id, window, camera, box]).encode())
+    return digest.hexdigest()
+
+
+def coarse_content(records: Iterable[PatchRecord]) -> list[tuple[float, ...]]:
+    """What other processors and library versions reproduce to within rounding; one row of figures per patch.
+
+    Mean colour (rgb, 0-255), car pixels, mean depth (m), focal length (px), box centre and size (m).
+    """
+    rows = []
+    for record in records:
+        patch = record.decode()
+        assert patch.depth_m is not None
+        assert record.box_center is not None
+        assert record.box_size is not None
+        mean = patch.image.reshape(-1, 3).mean(axis=0).tolist()
+        car = patch.mask == MaskValue.CAR
+        measured = (*mean, float(car.sum()), float(np.nanmean(patch.depth_m)))
+        rows.append((*measured, record.fx, *record.box_center, *record.box_size))
+    return rows
 
 
 def _check(config: SynthConfig) -> None:
