@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from carstudio.errors import InputError
-from carstudio.perception.hulls import allowed_pixels, enlarged_window, occluded_pixels
+from carstudio.perception.hulls import allowed_pixels, clean_mask, enlarged_window, occluded_pixels
 from carstudio.perception.results import MaskResult, SegmentRequest
 
 VOC_CAR = 7
@@ -33,7 +33,7 @@ class OnnxSegmenter:
     side_px: int = 384  # the network's training size; long side of the enlarged crop
     zoom_most: float = 3.0  # small cars are not blown up further
     threshold: float = 0.5  # probability above which a pixel is car
-    hull_margin: float = 0.03  # outline widened by this share of the box's height: labels are that exact
+    margin: float = 0.03  # outline widened by this share of the box's height: labels are that exact
 
     def segment(self, request: SegmentRequest) -> MaskResult:
         """Car where the class probability is above the threshold; score: mean probability of the car's pixels."""
@@ -42,9 +42,9 @@ class OnnxSegmenter:
         window = request.window
         probability = probability[window.within(context).slices]
         height_px = request.box2d[3] - request.box2d[1]
-        allowed = allowed_pixels(request, self.hull_margin * height_px, window)
+        allowed = allowed_pixels(request, self.margin * height_px, window)
         unknown = occluded_pixels(request, window) & allowed
-        car = (probability > self.threshold) & allowed & ~unknown
+        car = clean_mask((probability > self.threshold) & allowed & ~unknown) & ~unknown
         return MaskResult(car, unknown, float(probability[car].mean()) if car.any() else 0.0)
 
     def _probability(self, image: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width"]:

@@ -5,7 +5,7 @@ Positions are px of the whole photograph, pixel (u, v) centred at (u + 0.5, v + 
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -62,6 +62,7 @@ class MaskResult:
     score: float | None = None
 
 
+@runtime_checkable
 class Segmenter(Protocol):
     """Finds the visible pixels of one car; can be pickled, gives the same mask each time it is asked."""
 
@@ -69,6 +70,7 @@ class Segmenter(Protocol):
         """Masks of `request.window`; pixels of nearer objects are unknown."""
 
 
+@runtime_checkable
 class Detector(Protocol):
     """Finds cars in a photograph."""
 
