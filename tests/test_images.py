@@ -114,6 +114,9 @@ def test_truncated_files_are_named_not_half_decoded(kind):
 
 @pytest.mark.parametrize("data", [b"", b"\0" * 100, b"<html>404</html>", b"\x89PNG\r\n\x1a\n"])
 def test_what_is_no_image_is_named(data):
+    if not data:
+        with pytest.raises(InputError, match=r"^x\.png: expected an image, found an empty file"):
+            decode_image(data, name="x.png")
     for read in (decode_image, image_size, decode_depth):
         with pytest.raises(InputError, match=r"^x\.png: expected an image"):
             read(data, name="x.png")

@@ -20,7 +20,7 @@ def orbit_box(size: Float[Tensor, "3"], *, azimuth_deg: float, elevation_deg: fl
         [math.cos(elevation) * math.cos(azimuth), -math.sin(elevation), math.cos(elevation) * math.sin(azimuth)]
     )
     forward = -toward_camera
-    right = torch.nn.functional.normalize(torch.linalg.cross(size.new_tensor([0.0, 1.0, 0.0]), forward), dim=0)
+    right = size.new_tensor([-math.sin(azimuth), 0.0, math.cos(azimuth)])  # level; defined also straight from above
     rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])
     return Box3D(size.new_tensor([0.0, 0.0, distance_m]), size, rotation)
 
