@@ -15,5 +15,5 @@ def first_hit(origin: np.ndarray, direction: np.ndarray, triangles: np.ndarray) 
         q = np.cross(t_vec, edge1)
         v = (q @ direction) / determinant
         t = (edge2 * q).sum(-1) / determinant
-    hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 1e-9)
+        hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 1e-9)
     return float(t[hit].min()) if hit.any() else float("inf")

@@ -12,7 +12,14 @@ from carstudio.geometry.overlap import box2d_iou
 from carstudio.geometry.transforms import rotation_y, yaw_from_rotation
 from carstudio.synthetic.cameras import draw_viewpoint, look, viewpoint_at
 from carstudio.synthetic.cars import Car
-from carstudio.synthetic.photographs import Photograph, draw_azimuths, draw_photographs, exact_truth, picture
+from carstudio.synthetic.photographs import (
+    Photograph,
+    draw_azimuths,
+    draw_photographs,
+    draw_scene,
+    exact_truth,
+    picture,
+)
 from carstudio.synthetic.surfaces import CarMesh
 from carstudio.synthetic.tracing import Tracer
 from oracles.triangles import first_hit
@@ -172,8 +179,6 @@ def test_the_paint_is_seen(photographs: list[Photograph]) -> None:
 
 def test_the_ground_is_darker_below_the_car(red_car: Car) -> None:
     """Ambient occlusion: light on the ground under the car against the same far away."""
-    from carstudio.synthetic.photographs import draw_scene
-
     scene = draw_scene(red_car, np.random.default_rng(4))
     ground = red_car.mesh.size[1] / 2
     below, beside = (scene.baked.ground_light(np.array([[0.0, ground, z]])).sum() for z in (0.0, 2.6))

@@ -67,19 +67,23 @@ def _paint_front(finish: UInt8[np.ndarray, "rows columns"], points: Points, dept
     half = width / 2
     is_front = back < 0.75
     top = np.asarray(0.045 + 0.02 * (1 - z / half))
-    lamp = is_front & (z > 0.50 * half) & (back < 0.52) & (depth > top) & (depth < 0.225 - 0.17 * back)
+    lamp = is_front & (z > 0.50 * half) & (back < 0.52 * style.lamp_scale) & (depth > top)
+    lamp &= depth < style.lamp_scale * (0.225 - 0.17 * back)
     grille_low = 0.24 if style.name in ("van", "pickup", "suv") else 0.20
-    grille = is_front & (back < 0.40) & (z < 0.46 * half) & (depth > 0.06) & (depth < grille_low)
+    grille = is_front & (back < 0.40) & (z < style.grille_width * half) & (depth > 0.06) & (depth < grille_low)
     finish[grille] = Finish.GLOSS_BLACK
-    finish[grille & ((depth - 0.06) % 0.055 < 0.014)] = Finish.CHROME
-    finish[grille & ((depth < 0.078) | (z > 0.44 * half))] = Finish.CHROME
+    if style.has_chrome_grille:
+        finish[grille & ((depth - 0.06) % 0.055 < 0.014)] = Finish.CHROME
+        finish[grille & ((depth < 0.078) | (z > (style.grille_width - 0.02) * half))] = Finish.CHROME
+    else:
+        finish[grille & (np.hypot(depth - 0.12, z) < 0.045)] = Finish.CHROME  # the maker's badge
     intake = is_front & (h < style.clearance + 0.19) & (h > style.clearance + 0.09) & (z < 0.72 * half - 0.5 * back)
     finish[intake & (back < 0.35)] = Finish.TRIM
     finish[is_front & (back < 0.6) & (h < style.clearance + 0.085)] = Finish.TRIM
     fog = (np.hypot(z - 0.72 * half, h - style.clearance - 0.17) < 0.055) & (back < 0.5)
     finish[is_front & fog] = Finish.HEADLAMP
     finish[lamp] = Finish.HEADLAMP
-    finish[lamp & (back > 0.36)] = Finish.INDICATOR
+    finish[lamp & (back > 0.36 * style.lamp_scale)] = Finish.INDICATOR
     finish[lamp & ((depth < top + 0.012) | (np.abs(z - 0.52 * half) < 0.012))] = Finish.GLOSS_BLACK
     _paint_plate(finish, is_front & (back < 0.3), z, h - (style.clearance + 0.30), Finish.FRONT_PLATE)
 

@@ -63,6 +63,12 @@ class Style:
     corner: float = 4.0
     """Exponent of the super-ellipse of the plan view: 2 is an ellipse, large values are boxes."""
 
+    has_chrome_grille: bool = True
+    grille_width: float = 0.46
+    """Half width of the grille as a share of the car's half width."""
+    lamp_scale: float = 1.0
+    """Size of the head-lamps relative to the usual."""
+
     def vary(self, rng: np.random.Generator) -> "Style":
         """One car's own numbers: sizes by their deviations (cut at 2), positions by about 1 % of the length."""
         z = np.clip(rng.standard_normal(3), -2, 2)
@@ -82,6 +88,9 @@ class Style:
             belt_height=self.belt_height + float(tall[1]),
             cowl_height=self.cowl_height + float(0.5 * tall[0] + 0.5 * tall[1]),
             tail_height=self.tail_height + float(tall[1]),
+            has_chrome_grille=bool(rng.random() < 0.5),
+            grille_width=float(rng.uniform(0.32, 0.50)),
+            lamp_scale=float(rng.uniform(0.75, 1.2)),
             corner=self.corner * float(rng.uniform(0.88, 1.15)),
         )
 
