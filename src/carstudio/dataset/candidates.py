@@ -20,6 +20,13 @@ from carstudio.images import decode_image, encode_png
 from carstudio.perception.hulls import convex_hull
 from carstudio.perception.results import MaskResult, Segmenter, SegmentRequest, Window
 
+# Parts of the box that any car fills, as ranges of canonical x (front), y (down), z (left): body below the window line
+# and cabin. Of five variants the one whose GrabCut masks agree best with the network's; 2.5 % of its pixels are no car.
+CORE_PARTS = (
+    ((-0.9, 0.9), (-0.05, 0.8), (-0.9, 0.9)),
+    ((-0.7, 0.2), (-0.85, 0.0), (-0.65, 0.65)),
+)
+
 Pixels = UInt8[np.ndarray, "frame_height frame_width 3"]
 
 
@@ -53,10 +60,27 @@ def object_box(thing: LabelledObject) -> Box3D | None:
 def object_hull(thing: LabelledObject, camera: Camera) -> Float[np.ndarray, "n 2"] | None:
     """Convex outline of the projected 3-D box (px); None without a box or when it lies behind the camera."""
     box = object_box(thing)
-    if box is None:
-        return None
+    return None if box is None else box_hull(box, camera)
+
+
+def box_hull(box: Box3D, camera: Camera) -> Float[np.ndarray, "n 2"] | None:
+    """Convex outline of a projected box (px); None when it lies behind the camera."""
     points = projected_hull_points(box, camera).numpy()
     return convex_hull(points) if len(points) >= 3 else None
+
+
+def core_hulls(thing: LabelledObject, camera: Camera) -> tuple[Float[np.ndarray, "_ 2"], ...]:
+    """Outlines of `CORE_PARTS` of the object's box; empty without a box."""
+    box = object_box(thing)
+    if box is None:
+        return ()
+    low, high = torch.tensor(CORE_PARTS, dtype=torch.float64).unbind(-1)
+    parts = [
+        Box3D(box.center + box.rotation @ (middle * box.size / 2), share * box.size / 2, box.rotation)
+        for middle, share in zip((low + high) / 2, high - low, strict=True)
+    ]
+    hulls = [box_hull(part, camera) for part in parts]
+    return tuple(hull for hull in hulls if hull is not None)
 
 
 def occluder_hulls(thing: LabelledObject, frame: Frame, camera: Camera) -> tuple[np.ndarray, ...]:
@@ -138,6 +162,7 @@ def _request(frame: Frame, thing: LabelledObject, pixels: Pixels, camera: Camera
         window=window,
         box2d=thing.box2d,
         hull=object_hull(thing, camera),
+        core=core_hulls(thing, camera),
         occluders=occluder_hulls(thing, frame, camera),
         patch_id=thing.patch_id,
         frame_id=frame.frame_id,

@@ -1,4 +1,4 @@
-"""Segmenter `grabcut`: OpenCV's GrabCut, seeded by the outline of the 3-D box. It needs no weights.
+"""Segmenter `grabcut`: OpenCV's GrabCut, seeded by the projected 3-D box. It needs no weights.
 
 GrabCut fits colour models to car and surroundings and cuts between them (Rother et al., SIGGRAPH 2004).
 """
@@ -28,7 +28,7 @@ class GrabCutSegmenter:
     """Settings chosen on 59 KITTI cars (docs/dataset_format.md). It has no confidence: the score is None."""
 
     enlarge: float = 1.3  # surroundings that teach the background's colours
-    core: float = 0.75  # the outline shrunk by this factor is surely car; 1.7 % of its pixels are not
+    core: float = 0.75  # without a 3-D box: the 2-D box shrunk by this factor is surely car
     margin: float = 0.03  # outline widened by this share of the box's height: labels are that exact
     iterations: int = 2  # five give the same masks in 2.5 times the time
     seed: int = 0  # of OpenCV's generator, which starts the colour clusters
@@ -38,7 +38,9 @@ class GrabCutSegmenter:
         context = enlarged_window(request, self.enlarge)
         allowed = allowed_pixels(request, self.margin * (request.box2d[3] - request.box2d[1]), context)
         occluded = occluded_pixels(request, context)
-        core = fill_hull(shrink(outline(request), self.core), context)
+        core = np.zeros_like(allowed)
+        for part in request.core or (shrink(outline(request), self.core),):
+            core |= fill_hull(part, context)
         labels = np.full(allowed.shape, cv2.GC_BGD, np.uint8)
         labels[allowed & ~occluded] = cv2.GC_PR_FGD
         labels[core & allowed & ~occluded] = cv2.GC_FGD

@@ -47,6 +47,7 @@ class SegmentRequest:
     window: Window
     box2d: tuple[float, float, float, float]
     hull: Float[np.ndarray, "n 2"] | None = None  # of this car; None: no 3-D box
+    core: tuple[Float[np.ndarray, "_ 2"], ...] = ()  # outlines of parts of the box that any car fills
     occluders: tuple[Float[np.ndarray, "_ 2"], ...] = ()  # of nearer objects
     patch_id: str = ""
     frame_id: str = ""
