@@ -119,7 +119,7 @@ def open_source(config: BuildConfig) -> Source:
 
 def judge_store(store: PatchStore, recipe: FilterRecipe) -> list[Verdict]:
     """Judge every patch again by its stored values and replace the store's verdicts."""
-    verdicts = [judge(store.record(patch_id), recipe) for patch_id in store.patch_ids(kept=False)]
+    verdicts = [judge(record, recipe) for record in store.light_records()]
     store.write_verdicts(verdicts)
     return verdicts
 

@@ -84,9 +84,9 @@ def table_from_records(records: Sequence[PatchRecord]) -> pa.Table:
 
 
 def record_from_row(row: Mapping[str, Any]) -> PatchRecord:
-    """The record of one row as `pyarrow` gives it (`table.to_pylist()`)."""
-    values: dict[str, Any] = {}
-    for name in COLUMNS:
+    """The record of one row as `pyarrow` gives it (`table.to_pylist()`); pictures may be left out of the row."""
+    values: dict[str, Any] = {"image": b""}
+    for name in COLUMNS if "image" in row else LIGHT_COLUMNS:
         value = row[name]
         if value is not None:
             if name in PICTURES:

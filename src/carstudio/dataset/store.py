@@ -4,7 +4,7 @@
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -121,6 +121,11 @@ class PatchStore:
             )
         table = self._read_group(location.shard, location.group)
         return record_from_row(table.slice(location.row, 1).to_pylist()[0])
+
+    def light_records(self) -> Iterator[PatchRecord]:
+        """All candidates in store order without their pictures (`image` is empty): for filters."""
+        for batch in self.table().to_batches(max_chunksize=4096):
+            yield from map(record_from_row, batch.to_pylist())
 
     def patch(self, patch_id: str) -> Patch:
         """One patch decoded."""

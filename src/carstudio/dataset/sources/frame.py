@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from carstudio.errors import InputError
 
@@ -52,6 +52,7 @@ class FrameRef:
     stem: str  # file name without suffix
 
 
+@runtime_checkable
 class Source(Protocol):
     """A list of frames that can be loaded one by one, in any process (a source can be pickled)."""
 
