@@ -83,6 +83,21 @@ def test_depth_back_projected_lies_on_the_car_in_its_box(photographs: list[Photo
         assert bool((local.abs() <= box.size / 2 + 1e-3).all())
 
 
+def test_interpolated_positions_are_the_points_hit(red_car: Car) -> None:
+    """Vertex values at a hit carry the right weights: the vertices' own positions give the point on the ray."""
+    rng = np.random.default_rng(2)
+    origins = 8 * rng.standard_normal((200, 3)) / 1.7
+    origins[np.linalg.norm(origins, axis=1) < 4] += 6.0
+    directions = rng.uniform(-0.5, 0.5, (200, 3)) - origins
+    tracer = Tracer(red_car.mesh)
+    hits = tracer.first_hits(origins, directions)
+    assert len(hits.ray) > 100
+    points = origins[hits.ray] + hits.distance[:, None] * directions[hits.ray]
+    assert np.allclose(tracer.interpolate(red_car.mesh.vertices, hits), points, atol=1e-4)
+    towards = points - 1e-3 * directions[hits.ray]
+    assert not tracer.is_occluded(towards, -directions[hits.ray]).any()  # first hits: nothing lies before them
+
+
 def test_views_agree(photographs: list[Photograph], red_car: Car) -> None:
     """A point that two views see lies, by their cameras, at equal depth in both."""
     a, b = sorted(photographs, key=lambda photo: photo.viewpoint.azimuth_rad)[2:4]  # neighbours
