@@ -33,14 +33,7 @@ GIGABYTE = 1e9
 FRESH_SETUP_GB = 3.0  # measured: 1.9 GB in .venv with a CPU build of torch, plus what pip unpacks on the way
 CUDA_TORCH_GB = 9.0  # the default wheels on Linux bring CUDA libraries: about 3 GB to download, 6 GB unpacked
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-NETWORK_SIGNS = (
-    "NewConnectionError",
-    "ConnectTimeout",
-    "Name or service",
-    "resolve",
-    "ProxyError",
-    "Network is unreach",
-)
+NETWORK_SIGNS = ("NewConnectionError", "ConnectTimeout", "Name or service", "ProxyError", "No matching distribution")
 
 
 class SetupError(Exception):
@@ -327,7 +320,7 @@ def explain(failure: str, lines: list[str]) -> str:
     text = "".join(lines)
     hint = ""
     if any(sign in text for sign in NETWORK_SIGNS):
-        hint = "\n     The package index cannot be reached: check the network, a proxy (HTTPS_PROXY) or PIP_INDEX_URL"
+        hint = "\n     The package index cannot be reached or lacks this: check the network, HTTPS_PROXY, PIP_INDEX_URL"
     elif "No space left" in text:
         hint = "\n     The disk is full"
     tail = "".join(f"     | {line}" for line in lines[-15:]).rstrip()
