@@ -384,7 +384,7 @@ def test_pandas_duckdb_and_hugging_face_read_it(tmp_path: Path) -> None:
     assert frame["image"][5]["bytes"] == records[5].image
     query = f"""select count(*), sum(d.box_center[3]) from '{data}/part-*.parquet' d
                 join '{tmp_path}/s/verdicts.parquet' v using (patch_id) where v.is_kept"""
-    assert duckdb.sql(query).fetchone() == (69, 69 * 20.0)
+    assert duckdb.sql(query).fetchall() == [(69, 69 * 20.0)]
     cache = str(tmp_path / "cache")
     loaded = datasets.load_dataset("parquet", data_files=f"{data}/part-*.parquet", split="train", cache_dir=cache)
     assert loaded.num_rows == 70

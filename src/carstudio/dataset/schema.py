@@ -23,7 +23,6 @@ _INTEGERS = (
 _FLOATS = (
     "fx", "fy", "cx", "cy", "box_yaw", "score_2d", "score_mask", "score_3d", "mask_ratio", "box_iou", "truncation",
 )  # fmt: skip
-_OPTIONAL = {f.name for f in fields(PatchRecord) if f.type is not str and "None" in str(f.type)}
 _SAFE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _JPEG_MAGIC = b"\xff\xd8"
 
@@ -49,7 +48,7 @@ def _hugging_face_feature(name: str) -> dict[str, Any]:
 COLUMNS = tuple(field.name for field in fields(PatchRecord))
 LIGHT_COLUMNS = tuple(name for name in COLUMNS if name not in PICTURES)
 SCHEMA = pa.schema(
-    [pa.field(name, _arrow_type(name), nullable=name in _OPTIONAL) for name in COLUMNS],
+    [pa.field(name, _arrow_type(name)) for name in COLUMNS],  # nullable: `datasets` takes no picture from others
     metadata={
         "huggingface": json.dumps({"info": {"features": {name: _hugging_face_feature(name) for name in COLUMNS}}})
     },
