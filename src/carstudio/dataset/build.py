@@ -93,11 +93,12 @@ def build(config: BuildConfig, report: Report = silent) -> BuildSummary:
     source = open_source(config)
     segmenter = make_segmenter(config.segmenter)
     refs = source.frames()
+    workers = _num_workers(config.workers, len(refs))
     problems = list(source.problems)
     with StoreWriter(config.out, source=source.name, resume_key=_resume_key(config)) as writer:
         write_run(config.out, asdict(config))
         job = FrameJob(source, segmenter, config.types, writer.ids())
-        for done, result in enumerate(_run(job, refs, _num_workers(config.workers, len(refs))), start=1):
+        for done, result in enumerate(_run(job, refs, workers), start=1):
             for record in result.records:
                 writer.append(record)
             problems += result.problems

@@ -37,7 +37,7 @@ class PrecomputedSegmenter:
         if pixels.shape != request.image.shape[:2]:
             raise InputError(f"{path}: mask must have the photograph's size {_size(request.image)}, is {_size(pixels)}")
         window = request.window
-        allowed = allowed_pixels(request, 0, window)
+        allowed = allowed_pixels(request, 0.0, window)
         result = result_from_pixels(pixels[window.slices], request, name=str(path), score=None)
         unknown = (result.unknown | occluded_pixels(request, window)) & allowed
         return MaskResult(result.car & allowed & ~unknown, unknown)

@@ -1,0 +1,63 @@
+"""Splits: by hand, and by the properties that their names promise."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from carstudio.dataset.splits import View, split_as_released, split_by_instance, split_by_view
+
+
+def make_views(counts: list[int]) -> list[View]:
+    return [View(f"p-{car}-{k}", f"c-{car}", k) for car, count in enumerate(counts) for k in range(count)]
+
+
+COUNTS = st.lists(st.integers(1, 8), max_size=30)
+
+
+@given(COUNTS)
+def test_instance_split_shares_no_car(counts: list[int]) -> None:
+    views = make_views(counts)
+    parts = split_by_instance(views)
+    assert parts.keys() == {view.patch_id for view in views}
+    sides = {(view.instance_id, parts[view.patch_id]) for view in views}
+    assert len(sides) == len(counts)
+    tested = [name for name, part in sides if part == "test"]
+    assert len(tested) == (0 if len(counts) < 2 else -(-len(counts) // 10))
+    assert split_by_instance(views[::-1]) == parts  # order does not matter
+
+
+def test_instance_split_is_stable_when_cars_are_added() -> None:
+    few, many = split_by_instance(make_views([1] * 200)), split_by_instance(make_views([1] * 220))
+    moved = [patch for patch in few if few[patch] != many[patch]]
+    assert len(moved) <= 4  # 20 of 200 are tested; a random draw would move about 36
+
+
+def test_view_split_by_hand() -> None:
+    views = make_views([1, 2, 3, 4, 7])
+    parts = split_by_view(views)
+    by_car = ["".join(parts[v.patch_id][1] for v in views if v.instance_id == f"c-{car}") for car in range(5)]
+    assert by_car == ["r", "re", "rre", "rree", "rrrreee"]  # "r" for train, "e" for test
+
+
+@given(COUNTS, st.randoms())
+def test_view_split_goes_by_time_not_by_store_order(counts: list[int], random: object) -> None:
+    views = make_views(counts)
+    shuffled = list(views)
+    random.shuffle(shuffled)  # type: ignore[attr-defined]
+    assert split_by_view(shuffled) == split_by_view(views)
+
+
+def test_released_split_by_hand() -> None:
+    """N = 12: n_train = ceil(10.8) = 11, linspace(0, 11, 11) = 0, 1.1, 2.2, ..., 9.9, 11 -> 10 alone is left out."""
+    parts = split_as_released(make_views([12]))
+    assert [patch for patch, part in parts.items() if part == "test"] == ["p-0-10"]
+
+
+@given(st.integers(0, 400))
+def test_released_split_in_exact_arithmetic(count: int) -> None:
+    views = make_views([1] * count)
+    num_train = -(-9 * count // 10)
+    # int(i * (N - 1) / (n - 1)) in integers; numpy's linspace may fall one lower where that division is exact
+    exact = {i * (count - 1) // (num_train - 1) for i in range(num_train)} if num_train > 1 else {0} if count else set()
+    train = {i for i, view in enumerate(views) if split_as_released(views)[view.patch_id] == "train"}
+    assert len(train) == num_train
+    assert len(train ^ exact) <= 2
