@@ -5,17 +5,16 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
 from carstudio.dataset.manifest import Manifest, data_sha256, read_manifest
 from carstudio.dataset.patch import Patch, PatchRecord
-from carstudio.dataset.schema import LIGHT_COLUMNS, SCHEMA, check_id, record_from_row
+from carstudio.dataset.schema import LIGHT_COLUMNS, PICTURES, SCHEMA, check_id, record_from_row
 from carstudio.dataset.verdicts import Verdict, table_from_verdicts, verdicts_from_table
 from carstudio.dataset.verify import verify_store
 from carstudio.dataset.writer import StoreWriter, describe_shard, shard_paths, write_table
@@ -24,11 +23,10 @@ from carstudio.errors import InputError
 __all__ = ["PatchStore", "StoreWriter", "open_store"]
 
 PARTS = ("train", "test")
-_CACHED_GROUPS = 2  # decoded row groups kept, so that reading in order decodes each group once
+_CACHED_GROUPS = 2  # row groups whose pictures are kept, so that reading in order decodes each group once
 
 
-@dataclass(frozen=True)
-class Location:
+class Location(NamedTuple):
     """Where a patch lies: shard, row group in it, row in the group."""
 
     shard: int
@@ -47,7 +45,8 @@ class PatchStore:
     def __init__(self, path: Path, manifest: Manifest) -> None:
         self.path = path
         self.manifest = manifest
-        self._read_group = lru_cache(_CACHED_GROUPS)(self._read_group_now)
+        self._pictures = lru_cache(_CACHED_GROUPS)(self._read_pictures)
+        self._light = lru_cache(None)(self._read_light)  # some 600 bytes per patch: not read twice
 
     def __reduce__(self) -> tuple[Any, ...]:
         return open_store, (self.path,)
@@ -109,8 +108,11 @@ class PatchStore:
             ids = (patch_id for patch_id in ids if parts.get(patch_id) in wanted)
         return list(ids)
 
-    def _read_group_now(self, shard: int, group: int) -> pa.Table:
-        return self._files[shard].read_row_group(group)
+    def _read_pictures(self, shard: int, group: int) -> pa.Table:
+        return self._files[shard].read_row_group(group, columns=list(PICTURES), use_threads=False)
+
+    def _read_light(self, shard: int, group: int) -> pa.Table:
+        return self._files[shard].read_row_group(group, columns=list(LIGHT_COLUMNS), use_threads=False)
 
     def record(self, patch_id: str) -> PatchRecord:
         """One patch as stored."""
@@ -119,8 +121,9 @@ class PatchStore:
             raise InputError(
                 f"{self.path}: no patch {patch_id!r} among {len(self)}; `carstudio dataset info` lists them"
             )
-        table = self._read_group(location.shard, location.group)
-        return record_from_row(table.slice(location.row, 1).to_pylist()[0])
+        tables = (part(location.shard, location.group) for part in (self._light, self._pictures))
+        light, pictures = (table.slice(location.row, 1).to_pylist()[0] for table in tables)
+        return record_from_row(light | pictures)
 
     def light_records(self) -> Iterator[PatchRecord]:
         """All candidates in store order without their pictures (`image` is empty): for filters."""
