@@ -183,6 +183,16 @@ def test_bad_settings_are_explained_and_leave_nothing(
     assert not (tmp_path / "s").exists()
 
 
+def test_sequences_without_the_frames_asked_for_are_left_out(root: Path) -> None:
+    training = root / "training"
+    shutil.copytree(training / "image_02" / "0000", training / "image_02" / "0001")
+    for name in ("label_02", "calib"):
+        shutil.copy(training / name / "0000.txt", training / name / "0001.txt")
+    shutil.copy(training / "image_02" / "0000" / "000000.png", training / "image_02" / "0001" / "000009.png")
+    source = open_source(BuildConfig(source="kitti-mot", root=root, out=root, frames="5-20"))
+    assert [(ref.sequence_id, ref.index) for ref in source.frames()] == [("0001", 9)]
+
+
 def test_sequence_is_refused_for_kitti_det(root: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--sequence is for kitti-mot"):
         open_source(BuildConfig(source="kitti-det", root=root, out=tmp_path, sequence="0000"))

@@ -63,7 +63,8 @@ class KittiDetSource:
 def open_kitti_det(root: Path, *, frames: str | None = None) -> KittiDetSource:
     """The frames with an image; `InputError` when there are none."""
     folder = find_layout(root, "image_2", "image_2, label_2, calib")
-    return KittiDetSource(folder, list_frames(folder / "image_2", frames))
+    refs = list_frames(folder / "image_2", frames)
+    return KittiDetSource(folder, require_frames(refs, folder / "image_2", frames))
 
 
 def list_frames(folder: Path, frames: str | None, sequence_id: str | None = None) -> tuple[FrameRef, ...]:
@@ -73,10 +74,15 @@ def list_frames(folder: Path, frames: str | None, sequence_id: str | None = None
     refs = [FrameRef(sequence_id, int(stem), stem) for stem in stems]
     if limits is not None:
         refs = [ref for ref in refs if limits[0] <= ref.index <= limits[1]]
+    return tuple(sorted(refs, key=lambda ref: (ref.index, ref.stem)))
+
+
+def require_frames(refs: Sequence[FrameRef], folder: Path, frames: str | None) -> tuple[FrameRef, ...]:
+    """`refs`, or `InputError` when there are none."""
     if not refs:
         wanted = "" if frames is None else f" within --frames {frames}"
         raise InputError(f"{folder}: no numbered images{wanted}; expected NNNNNN.png")
-    return tuple(sorted(refs, key=lambda ref: (ref.index, ref.stem)))
+    return tuple(refs)
 
 
 def find_image(folder: Path, stem: str) -> Path:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from carstudio.dataset.sources.frame import Frame, FrameRef
-from carstudio.dataset.sources.kitti_det import find_image, labelled_object, list_frames
+from carstudio.dataset.sources.kitti_det import find_image, labelled_object, list_frames, require_frames
 from carstudio.dataset.sources.kitti_format import (
     DONT_CARE,
     KITTI_LICENCE,
@@ -85,12 +85,13 @@ def open_kitti_mot(root: Path, *, sequence: str | None = None, frames: str | Non
     problems: list[str] = []
     for name in chosen:
         sequence_refs = list_frames(folder / "image_02" / name, frames, sequence_id=name)
+        if not sequence_refs:
+            continue
         drives[name], found = _open_sequence(folder, name)
         refs += sequence_refs
         problems += found
-    if not refs:
-        raise InputError(f"{folder / 'image_02'}: no sequences; expected folders such as 0001")
-    return KittiMotSource(folder, tuple(refs), drives, problems=tuple(problems))
+    refs_found = require_frames(refs, folder / "image_02", frames)
+    return KittiMotSource(folder, refs_found, drives, problems=tuple(problems))
 
 
 def _open_sequence(folder: Path, name: str) -> tuple[Drive, tuple[str, ...]]:
