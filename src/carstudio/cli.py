@@ -10,7 +10,7 @@ import tyro
 
 from carstudio import __version__
 from carstudio.allocator import keep_freed_memory
-from carstudio.commands.command import Command
+from carstudio.commands.command import Output
 from carstudio.errors import InputError
 
 # verb -> (class that parses and runs it, what it does). The class is imported only when its verb is called.
@@ -46,7 +46,7 @@ def run(arguments: list[str]) -> int:
         return 2
     keep_freed_memory()
     module, name = VERBS[verb][0].split(":")
-    command: Command = tyro.cli(
+    command: Output = tyro.cli(
         getattr(import_module(module), name),
         prog=f"carstudio {verb}",
         args=rest,
@@ -55,7 +55,7 @@ def run(arguments: list[str]) -> int:
     return execute(command)
 
 
-def execute(command: Command) -> int:
+def execute(command: Output) -> int:
     """Run a parsed verb, print its outcome, and turn a user's error into one message."""
     try:
         outcome = command.run()

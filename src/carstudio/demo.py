@@ -157,7 +157,7 @@ def _turn(config: DemoConfig, model: CategoryModel, store: PatchStore, report: R
         frames = turntable(model, latents, box, views=30, size_px=160)
         photo = fit(prepared.rgb.numpy(), 160, 160)
         path = config.out / "turntables" / f"{patch_id}.gif"
-        write_gif(path, [np.concatenate([photo, frame], axis=1) for frame in frames.rgb], fps=10)
+        write_gif(path, [np.concatenate([photo, frame], axis=1) for frame in frames.rgb], fps=10.0)
         pictures.append(Picture(source=path.read_bytes(), caption=patch_id, alt="photo, and the car turning"))
         report("turntables", done, len(chosen), patch_id)
     return pictures

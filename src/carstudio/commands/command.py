@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from carstudio import __version__
 from carstudio.progress import Report, RichProgress, silent
@@ -23,12 +23,16 @@ class Outcome:
 
 @dataclass(frozen=True, kw_only=True)
 class Output:
-    """Options of every verb."""
+    """Base of every verb: the options they share."""
 
     json: bool = False
     """Print a machine-readable result."""
     quiet: bool = False
     """No progress bars."""
+
+    def run(self) -> Outcome:
+        """Do the work of the verb."""
+        raise NotImplementedError
 
     @contextmanager
     def progress(self) -> Iterator[Report]:
@@ -38,15 +42,6 @@ class Output:
             return
         with RichProgress() as bars:
             yield bars
-
-
-class Command(Protocol):
-    """A parsed verb."""
-
-    json: bool
-
-    def run(self) -> Outcome:
-        """Do the work."""
 
 
 def plain(value: Any) -> Any:

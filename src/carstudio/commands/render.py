@@ -60,8 +60,8 @@ class Render(Output):
                         write_png(folder / name / f"{i:03d}.png", frame)
                 rows = zip(frames.rgb, frames.opacity, frames.depth, strict=True)
                 joined = [np.concatenate(row, axis=1) for row in rows]
-                write_gif(folder / "turntable.gif", joined, fps=12)
-                write_mp4(folder / "turntable.mp4", joined, fps=12)
+                write_gif(folder / "turntable.gif", joined, fps=12.0)
+                write_mp4(folder / "turntable.mp4", joined, fps=12.0)
                 report("rendering", done, len(patch_ids), patch_id)
         return Outcome(f"{len(patch_ids)} cars in {self.out}", {"cars": list(patch_ids), "out": str(self.out)})
 

@@ -62,8 +62,8 @@ def view_pairs(store: PatchStore, config: EvaluationConfig) -> list[ViewPair]:
         pairs = list(_novel_pairs(scored, _input_pool(store, config, scored), instance_of, config.seed))
     if not pairs:
         raise InputError(
-            f"{store.path}: nothing to score for protocol {config.protocol}, split {config.split!r}, part {config.part}; "
-            "novel-view needs cars with at least two kept views"
+            f"{store.path}: nothing to score for protocol {config.protocol}, split {config.split!r}, "
+            f"part {config.part}; novel-view needs cars with at least two kept views"
         )
     if config.limit is not None and len(pairs) > config.limit:
         pairs = [pairs[i * len(pairs) // config.limit] for i in range(config.limit)]

@@ -1,0 +1,134 @@
+"""Speed and memory of this machine: `./run bench` (or `python -m bench`) prints a Markdown table.
+
+Training: one step (encode, trace, loss, backward, RAdam) of a recipe at its own batch, patches of the sizes that the
+toy photos have. Rendering: one 128 x 128 view. Rounds of the recipes are interleaved and medians are given, because
+shared machines drift; the ratio is to `car-nerf` within the same round. Memory is the growth of the process' peak.
+"""
+
+import argparse
+import json
+import platform
+import resource
+import statistics
+import time
+from collections.abc import Callable
+
+import torch
+
+from bench.patches import random_batch
+from carstudio.allocator import keep_freed_memory
+from carstudio.geometry.orbit import orbit_camera
+from carstudio.models.interface import render_image
+from carstudio.models.zoo import build_model
+from carstudio.recipes import recipe
+from carstudio.rendering.rays import to_canonical
+from carstudio.rendering.volume import composite
+from carstudio.training.batches import generator_for
+from carstudio.training.checkpoint import pick_device
+from carstudio.training.losses import training_loss
+
+
+class Subject:
+    """A recipe with a fresh model, ready to train a step and to render a view."""
+
+    def __init__(self, name: str, device: torch.device) -> None:
+        self.name, self.device, self.config = name, device, recipe(name)
+        torch.manual_seed(0)
+        self.model = build_model(self.config.model).to(device)
+        self.optimizer = torch.optim.RAdam(self.model.parameters(), lr=1e-4)
+        batch = random_batch(self.config.patches_per_step, self.config.rays_per_patch, self.model.encoder_side_px)
+        self.patches, self.pixels = (part.to(device) for part in batch)
+        self.rays = self.config.patches_per_step * self.config.rays_per_patch
+
+    def train_step(self) -> None:
+        """What the trainer does in one step, without logging."""
+        self.model.train()
+        latents = self.model.encode(self.patches)
+        levels = self.model.trace_levels(self.pixels.rays, latents, self.pixels.box, generator_for(0, 0, "jitter"))
+        counts = self.pixels.is_known & to_canonical(self.pixels.rays, self.pixels.box).hit
+        rendered = tuple(composite(level) for level in levels)
+        terms = training_loss(rendered, self.pixels.rgb, self.pixels.alpha, counts, self.config.loss)
+        self.optimizer.zero_grad(set_to_none=True)
+        torch.stack(list(terms.values())).sum().backward()
+        self.optimizer.step()
+
+    def render_view(self) -> None:
+        """One 128 x 128 view of the first car."""
+        self.model.eval()
+        with torch.no_grad():
+            latents = self.model.encode(self.patches).select(0)
+        box = type(self.pixels.box)(*(value[:1] for value in vars(self.pixels.box).values()))
+        render_image(self.model, orbit_camera(128), latents, box)
+
+
+def measure(action: Callable[[], None], device: torch.device) -> tuple[float, float]:
+    """(wall seconds, processor seconds) of one call, the device's queue drained."""
+    wall, processor = time.perf_counter(), time.process_time()
+    action()
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter() - wall, time.process_time() - processor
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(prog="bench", description="Training and rendering speed of recipes")
+    parser.add_argument("--recipes", nargs="+", default=["car-nerf", "car-nerf-small"])
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    keep_freed_memory()
+    device = pick_device(options.device)
+    subjects = [Subject(name, device) for name in options.recipes]
+    seconds: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    memory: dict[str, float] = {}
+    for subject in subjects:  # warm-up, and the peak memory of one step
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        subject.train_step()
+        memory[subject.name] = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    for _ in range(options.rounds):
+        for subject in subjects:
+            seconds.setdefault((subject.name, "train"), []).append(measure(subject.train_step, device))
+            seconds.setdefault((subject.name, "render"), []).append(measure(subject.render_view, device))
+    rows = [row(subject, seconds, subjects[0].name, memory) for subject in subjects]
+    print(json.dumps(rows, indent=2) if options.json else table(rows, device, options.rounds))
+
+
+def row(
+    subject: Subject, seconds: dict[tuple[str, str], list[tuple[float, float]]], base: str, memory: dict[str, float]
+) -> dict[str, float | str]:
+    """Medians and the median ratio to the first recipe, per ray."""
+    train, render = seconds[subject.name, "train"], seconds[subject.name, "render"]
+    base_rays = recipe(base).patches_per_step * recipe(base).rays_per_patch
+    pairs = zip(train, seconds[base, "train"], strict=True)
+    return {
+        "recipe": subject.name,
+        "train_rays_per_s": subject.rays / statistics.median(wall for wall, _ in train),
+        "train_rays_per_cpu_s": subject.rays / statistics.median(cpu for _, cpu in train),
+        "train_ratio": statistics.median((b[1] / base_rays) / (a[1] / subject.rays) for a, b in pairs),
+        "render_rays_per_s": 128 * 128 / statistics.median(wall for wall, _ in render),
+        "render_rays_per_cpu_s": 128 * 128 / statistics.median(cpu for _, cpu in render),
+        "step_memory_mib": memory[subject.name],
+    }
+
+
+def table(rows: list[dict[str, float | str]], device: torch.device, rounds: int) -> str:
+    """Markdown."""
+    lines = [
+        f"torch {torch.__version__}, {device}, {torch.get_num_threads()} threads, {platform.machine()}; "
+        f"medians of {rounds} interleaved rounds; render: 128 x 128 view, rays that miss the box included.",
+        "",
+        "| recipe | train rays/s | train rays/CPU-s | ratio | render rays/s | render rays/CPU-s | step memory (MiB) |",
+        "|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    for found in rows:
+        figures = [f"{found[key]:,.0f}" for key in ("train_rays_per_s", "train_rays_per_cpu_s")]
+        figures += [f"{found['train_ratio']:.1f}"]
+        figures += [f"{found[key]:,.0f}" for key in ("render_rays_per_s", "render_rays_per_cpu_s", "step_memory_mib")]
+        lines.append(f"| {found['recipe']} | " + " | ".join(figures) + " |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()

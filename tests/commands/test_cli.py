@@ -1,0 +1,102 @@
+"""The command line as a user meets it: whole runs on a toy store, exit codes, messages."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from carstudio.cli import VERBS, run
+from carstudio.images import read_image
+from training.toy import toy_store
+
+TRAIN = ["--quiet", "--steps", "2", "--split", "None", "--device", "cpu", "--pictures", "2"]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with a store `data` and a trained run `run`."""
+    folder = tmp_path_factory.mktemp("cli")
+    toy_store(folder / "data", cars=3, views=3)
+    assert run(["train", "car-nerf-small", "--data", str(folder / "data"), "--out", str(folder / "run"), *TRAIN]) == 0
+    return folder
+
+
+def test_help_names_every_verb(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run([]) == 0
+    shown = capsys.readouterr().out
+    assert all(f"  {verb}" in shown for verb in VERBS)
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_explains_itself(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        run([verb, "--help"])
+    assert stop.value.code == 0
+    assert "--json" in capsys.readouterr().out
+
+
+def test_an_unknown_verb_is_the_users_error(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["trian"]) == 2
+    assert "no verb 'trian'" in capsys.readouterr().err
+
+
+def test_training_leaves_model_log_and_picture(trained: Path) -> None:
+    names = {path.name for path in (trained / "run").iterdir()}
+    assert {"model.safetensors", "model.json", "log.jsonl", "training.safetensors", "pictures"} <= names
+    picture = read_image(next((trained / "run" / "pictures").iterdir()))
+    assert picture.shape[1] > 5 * 100
+
+
+def test_evaluate_writes_rows_and_prints_json(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = trained / "rows.jsonl"
+    command = ["evaluate", str(trained / "run"), "--data", str(trained / "data"), "--protocol", "novel-view"]
+    assert run([*command, "--split", "none", "--out", str(rows), "--json", "--device", "cpu"]) == 0
+    value = json.loads(capsys.readouterr().out)
+    assert value["rows"] == len(rows.read_text().splitlines()) == 9
+    assert json.loads(rows.read_text().splitlines()[0])["method"] == "car-nerf-small"
+    assert "lpips" in json.loads((trained / "rows.header.json").read_text())["reasons"]
+
+
+def test_render_goes_round_the_car(trained: Path) -> None:
+    out = trained / "views"
+    command = ["render", str(trained / "run"), "--data", str(trained / "data"), "--patches", "toy-0-0"]
+    assert run([*command, "--out", str(out), "--views", "3", "--size", "24", "--device", "cpu"]) == 0
+    for kind in ("rgb", "opacity", "depth"):
+        assert [path.name for path in sorted((out / "toy-0-0" / kind).iterdir())] == ["000.png", "001.png", "002.png"]
+    assert (out / "toy-0-0" / "turntable.gif").read_bytes()[:4] == b"GIF8"
+    assert b"ftyp" in (out / "toy-0-0" / "turntable.mp4").read_bytes()[:12]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["train", "no-such", "--data", "DATA", "--out", "OUT"], "recipe must be one of"),
+        (["train", "car-nerf-small", "--data", "NOWHERE", "--out", "OUT"], "NOWHERE"),
+        (["train", "car-nerf-small", "--data", "DATA", "--out", "RUN", "--split", "None"], "--resume"),
+        (["train", "car-nerf-small", "--data", "DATA", "--out", "OUT", "--device", "abacus"], "abacus"),
+        (["evaluate", "DATA", "--data", "DATA", "--protocol", "input-view", "--out", "R"], "expected a trained model"),
+        (
+            ["evaluate", "RUN", "--data", "DATA", "--protocol", "input-view", "--out", "R", "--split", "instance"],
+            "NAME:test",
+        ),
+        (["render", "RUN", "--data", "DATA", "--out", "OUT", "--patches", "toy-9-9"], "toy-9-9"),
+        (["render", "RUN", "--data", "DATA", "--out", "OUT", "--size", "0"], "--size"),
+        (["dataset", "info", "NOWHERE"], "NOWHERE"),
+        (["build", "kitti-mot", "--root", "NOWHERE", "--out", "OUT"], "NOWHERE"),
+    ],
+)
+def test_the_users_errors_are_one_message_and_exit_code_2(
+    arguments: list[str], message: str, trained: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    places = {"DATA": trained / "data", "RUN": trained / "run", "OUT": trained / "new", "R": trained / "r.jsonl"}
+    places["NOWHERE"] = trained / "NOWHERE"
+    assert run([str(places.get(argument, argument)) for argument in arguments]) == 2
+    shown = capsys.readouterr().err
+    assert message in shown
+    assert shown.startswith("error: ")
+    assert "Traceback" not in shown
+
+
+def test_dataset_info_and_verify(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["dataset", "info", str(trained / "data"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["patches"] == 9
