@@ -1,8 +1,9 @@
 """Speed and memory of this machine: `./run bench` (or `python -m bench`) prints a Markdown table.
 
-Training: one step (encode, trace, loss, backward, RAdam) of a recipe at its own batch, patches of the sizes that the
-toy photos have. Rendering: one 128 x 128 view. Rounds of the recipes are interleaved and medians are given, because
-shared machines drift; the ratio is to `car-nerf` within the same round. Memory is the growth of the process' peak.
+Training: one step (encode, trace, loss, backward, RAdam) of a recipe with its own number of patches and --rays rays of
+each (the activations of a paper-size step, 3 x 1,024 rays, may not fit a laptop). Rendering: one view of --size px.
+Rounds of the recipes are interleaved and medians are given, because shared machines drift; the ratio is to the first
+recipe within the same round. Memory is how far the first step raises the peak of the process.
 """
 
 import argparse
@@ -31,14 +32,14 @@ from carstudio.training.losses import training_loss
 class Subject:
     """A recipe with a fresh model, ready to train a step and to render a view."""
 
-    def __init__(self, name: str, device: torch.device) -> None:
+    def __init__(self, name: str, device: torch.device, rays_per_patch: int, size_px: int) -> None:
         self.name, self.device, self.config = name, device, recipe(name)
         torch.manual_seed(0)
         self.model = build_model(self.config.model).to(device)
         self.optimizer = torch.optim.RAdam(self.model.parameters(), lr=1e-4)
-        batch = random_batch(self.config.patches_per_step, self.config.rays_per_patch, self.model.encoder_side_px)
+        batch = random_batch(self.config.patches_per_step, rays_per_patch, self.model.encoder_side_px)
         self.patches, self.pixels = (part.to(device) for part in batch)
-        self.rays = self.config.patches_per_step * self.config.rays_per_patch
+        self.rays, self.size_px = self.config.patches_per_step * rays_per_patch, size_px
 
     def train_step(self) -> None:
         """What the trainer does in one step, without logging."""
@@ -53,12 +54,12 @@ class Subject:
         self.optimizer.step()
 
     def render_view(self) -> None:
-        """One 128 x 128 view of the first car."""
+        """One view of the first car."""
         self.model.eval()
         with torch.no_grad():
             latents = self.model.encode(self.patches).select(0)
         box = type(self.pixels.box)(*(value[:1] for value in vars(self.pixels.box).values()))
-        render_image(self.model, orbit_camera(128), latents, box)
+        render_image(self.model, orbit_camera(self.size_px), latents, box)
 
 
 def measure(action: Callable[[], None], device: torch.device) -> tuple[float, float]:
@@ -75,12 +76,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="bench", description="Training and rendering speed of recipes")
     parser.add_argument("--recipes", nargs="+", default=["car-nerf", "car-nerf-small"])
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--rays", type=int, default=128, help="rays per patch of a training step")
+    parser.add_argument("--size", type=int, default=64, help="side of the rendered view, px")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     keep_freed_memory()
     device = pick_device(options.device)
-    subjects = [Subject(name, device) for name in options.recipes]
+    subjects = [Subject(name, device, options.rays, options.size) for name in options.recipes]
     seconds: dict[tuple[str, str], list[tuple[float, float]]] = {}
     memory: dict[str, float] = {}
     for subject in subjects:  # warm-up, and the peak memory of one step
@@ -91,33 +94,33 @@ def main() -> None:
         for subject in subjects:
             seconds.setdefault((subject.name, "train"), []).append(measure(subject.train_step, device))
             seconds.setdefault((subject.name, "render"), []).append(measure(subject.render_view, device))
-    rows = [row(subject, seconds, subjects[0].name, memory) for subject in subjects]
-    print(json.dumps(rows, indent=2) if options.json else table(rows, device, options.rounds))
+    rows = [row(subject, seconds, subjects[0], memory) for subject in subjects]
+    print(json.dumps(rows, indent=2) if options.json else table(rows, device, options))
 
 
 def row(
-    subject: Subject, seconds: dict[tuple[str, str], list[tuple[float, float]]], base: str, memory: dict[str, float]
+    subject: Subject, seconds: dict[tuple[str, str], list[tuple[float, float]]], base: Subject, memory: dict[str, float]
 ) -> dict[str, float | str]:
     """Medians and the median ratio to the first recipe, per ray."""
     train, render = seconds[subject.name, "train"], seconds[subject.name, "render"]
-    base_rays = recipe(base).patches_per_step * recipe(base).rays_per_patch
-    pairs = zip(train, seconds[base, "train"], strict=True)
+    pairs = zip(train, seconds[base.name, "train"], strict=True)
     return {
         "recipe": subject.name,
         "train_rays_per_s": subject.rays / statistics.median(wall for wall, _ in train),
         "train_rays_per_cpu_s": subject.rays / statistics.median(cpu for _, cpu in train),
-        "train_ratio": statistics.median((b[1] / base_rays) / (a[1] / subject.rays) for a, b in pairs),
-        "render_rays_per_s": 128 * 128 / statistics.median(wall for wall, _ in render),
-        "render_rays_per_cpu_s": 128 * 128 / statistics.median(cpu for _, cpu in render),
+        "train_ratio": statistics.median((b[1] / base.rays) / (a[1] / subject.rays) for a, b in pairs),
+        "render_rays_per_s": subject.size_px**2 / statistics.median(wall for wall, _ in render),
+        "render_rays_per_cpu_s": subject.size_px**2 / statistics.median(cpu for _, cpu in render),
         "step_memory_mib": memory[subject.name],
     }
 
 
-def table(rows: list[dict[str, float | str]], device: torch.device, rounds: int) -> str:
+def table(rows: list[dict[str, float | str]], device: torch.device, options: argparse.Namespace) -> str:
     """Markdown."""
     lines = [
         f"torch {torch.__version__}, {device}, {torch.get_num_threads()} threads, {platform.machine()}; "
-        f"medians of {rounds} interleaved rounds; render: 128 x 128 view, rays that miss the box included.",
+        f"medians of {options.rounds} interleaved rounds; {options.rays} rays per patch and training step; ratio per "
+        f"processor second; render: one {options.size} x {options.size} view, rays that miss the box included.",
         "",
         "| recipe | train rays/s | train rays/CPU-s | ratio | render rays/s | render rays/CPU-s | step memory (MiB) |",
         "|---|---:|---:|---:|---:|---:|---:|",
