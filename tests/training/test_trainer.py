@@ -158,3 +158,31 @@ def test_schedules() -> None:
     assert learning_rate(small, 0, 0.0) == pytest.approx(2e-4)
     assert learning_rate(small, 9, 0.0) == pytest.approx(2e-3)
     assert learning_rate(small, 500, 0.5) == pytest.approx(math.sqrt(2e-3 * 2e-4))
+
+
+def test_a_run_may_start_from_another_runs_weights(store: PatchStore, tmp_path: Path) -> None:
+    train(TINY, store, tmp_path / "first", device="cpu")
+    frozen = dataclasses.replace(TINY, steps=1, schedule=ScheduleConfig(first=1e-30, last=1e-30, decay_steps=None))
+    summary = train(frozen, store, tmp_path / "second", device="cpu", init=tmp_path / "first")
+    theirs, ours = (load_model(tmp_path / name).state_dict() for name in ("first", "second"))
+    assert all(torch.equal(theirs[name], ours[name]) for name in theirs)
+    description = describe_model(tmp_path / "second")
+    assert summary.starts_from == description.provenance["starts_from"]
+    assert describe_model(tmp_path / "first").sha256[:16] in summary.starts_from
+
+    wider = dataclasses.replace(TINY, model=dataclasses.replace(TINY.model, width=48))
+    with pytest.raises(InputError, match=r"differs from the recipe's in \['width'\]"):
+        train(wider, store, tmp_path / "third", device="cpu", init=tmp_path / "first")
+
+
+def test_bfloat16_learns_what_float32_learns(store: PatchStore, tmp_path: Path) -> None:
+    """The same 120 steps gain at least 1 dB in both formats and end within half a decibel of each other."""
+    psnr = {}
+    for precision in ("float32", "bfloat16"):
+        config = dataclasses.replace(TINY, steps=120, precision=precision)
+        summary = train(config, store, tmp_path / precision, device="cpu")
+        assert summary.precision == precision
+        curve = [row["psnr"] for row in read_log(tmp_path / precision / "log.jsonl")]
+        psnr[precision] = sum(curve[-10:]) / 10
+        assert psnr[precision] > sum(curve[:5]) / 5 + 1.0
+    assert abs(psnr["float32"] - psnr["bfloat16"]) < 0.5, psnr

@@ -33,6 +33,8 @@ class Train(Output):
     """auto, cpu, cuda, cuda:1, mps, ..."""
     seed: int = 0
     """Start of all randomness."""
+    init: Path | None = None
+    """Run whose weights to start from (same recipe), such as one trained on many synthetic cars."""
     resume: bool = False
     """Go on with the run in --out."""
     split: str | None = "instance"
@@ -66,13 +68,14 @@ class Train(Output):
                 self.out,
                 device=self.device,
                 resume=self.resume,
+                init=self.init,
                 provenance={**provenance(), **store_origin(store)},
                 report=report,
                 on_save=draw,
             )
         text = (
             f"{self.recipe}: {summary.steps} steps in {summary.seconds:.0f} s ({summary.rays_per_s:,.0f} rays/s), "
-            f"encoder from {summary.encoder_start}; PSNR on the last batch's car pixels {summary.psnr:.2f} dB\n"
+            f"{summary.precision}, {summary.starts_from}; PSNR on the last batch's car pixels {summary.psnr:.2f} dB\n"
             f"model in {self.out}"
         )
         return Outcome(text, plain(summary))

@@ -88,6 +88,17 @@ def load_model(path_or_name: Path | str, *, device: torch.device | str = "cpu") 
     return model.to(device).eval()
 
 
+def load_weights_of(folder: Path, model: CategoryModel, config: ModelConfig) -> str:
+    """Give `model` the weights of another run of the same model config; says in words what it now starts from."""
+    description = describe_model(folder)
+    if description.config != config:
+        theirs, ours = config_to_json(description.config), config_to_json(config)
+        different = [key for key in ours if theirs.get(key) != ours[key]]
+        raise InputError(f"{folder}: its model differs from the recipe's in {different}; start from the same recipe")
+    load_weights(model, load_tensors(folder / WEIGHTS), name=str(folder / WEIGHTS))
+    return f"weights {description.sha256[:16]} of {folder.name}"
+
+
 def load_weights(model: torch.nn.Module, tensors: dict[str, torch.Tensor], *, name: str) -> None:
     """`load_state_dict` with an error a user can read: names what is missing, left over or of another shape."""
     expected = model.state_dict()

@@ -20,10 +20,11 @@ from carstudio.progress import Report, silent
 from carstudio.rendering.rays import to_canonical
 from carstudio.rendering.volume import composite
 from carstudio.training.batches import StepSampler, Supervision, generator_for
-from carstudio.training.checkpoint import pick_device, save_model
+from carstudio.training.checkpoint import load_weights_of, pick_device, save_model
 from carstudio.training.log import TrainingLog
 from carstudio.training.losses import LossConfig, masked_psnr, training_loss
-from carstudio.training.resume import TrainingState, load_state, save_state
+from carstudio.training.precision import Precision, autocast, resolve_precision
+from carstudio.training.resume import STATE, TrainingState, load_state, save_state
 from carstudio.training.schedule import ScheduleConfig, learning_rate
 
 
@@ -51,6 +52,8 @@ class TrainConfig:
     """Stop after this much time instead, and let the learning rate follow the clock."""
     clip_gradient: float | None = None
     """Largest gradient norm; None: not clipped, as released."""
+    precision: Precision = "float32"
+    """Number format of matrix products; "auto": bfloat16 where the device has matrix units for it."""
     seed: int = 0
     """Start of all randomness."""
     split: str | None = "instance"
@@ -70,7 +73,8 @@ class TrainSummary:
     seconds: float
     rays_per_s: float
     psnr: float
-    encoder_start: str
+    starts_from: str
+    precision: str
     sha256: str
 
 
@@ -81,16 +85,19 @@ def train(
     *,
     device: str = "auto",
     resume: bool = False,
+    init: Path | None = None,
     provenance: dict[str, Any] | None = None,
     report: Report = silent,
     on_save: Callable[[CategoryModel, int], None] | None = None,
 ) -> TrainSummary:
     """Train a model on a store's kept patches and leave it in `out` (model, log, state to resume from).
 
+    `init` is a trained model of the same config whose weights the run starts from (a resumed run has its own).
     `on_save(model, step)` is called after each checkpoint, for pictures. Killed at any moment and resumed, a run by
     steps ends with the same bits on a CPU as an uninterrupted one.
     """
-    run = _Run(config, store, out, pick_device(device), resume, provenance or {})
+    run = _Run(config, store, out, pick_device(device), provenance or {})
+    run.begin(resume=resume, init=init)
     try:
         while not run.is_done():
             figures = run.one_step()
@@ -115,7 +122,6 @@ class _Run:
         store: PatchStore,
         out: Path,
         device: torch.device,
-        resume: bool,
         provenance: dict[str, Any],
     ) -> None:
         self.config, self.out, self.device, self.provenance = config, out, device, provenance
@@ -124,15 +130,9 @@ class _Run:
             raise InputError(f"{store.path}: no kept patch in the training part of split {config.split!r}")
         torch.manual_seed(config.seed)
         self.model = build_model(config.model).to(device)
-        self.encoder_start = "resumed"
+        self.starts_from = ""
         self.optimizer = torch.optim.RAdam(self.model.parameters(), lr=config.schedule.first, eps=1e-8)
         self.step, self.seconds, self.psnr, self.rays_per_s = 0, 0.0, math.nan, 0.0
-        if resume:
-            self._restore(load_state(out))
-        elif (out / "training.safetensors").exists():
-            raise InputError(f"{out} holds a run already; add --resume to go on with it, or choose another --out")
-        else:
-            self.encoder_start = self.model.load_pretrained_parts()
         cache = PatchCache(store, self.model.encoder_side_px)
         self.sampler = StepSampler(
             cache,
@@ -141,14 +141,25 @@ class _Run:
             supervision=config.supervision,
             seed=config.seed,
         )
-        self.trainlog = TrainingLog(out, resume_step=self.step)
+
+    def begin(self, *, resume: bool, init: Path | None) -> None:
+        """Put the first weights in place, open the log and start the clocks."""
+        if resume:
+            self._restore(load_state(self.out))
+        elif (self.out / STATE).exists():
+            raise InputError(f"{self.out} holds a run already; add --resume to go on with it, or choose another --out")
+        elif init is not None:
+            self.starts_from = load_weights_of(init, self.model, self.config.model)
+        else:
+            self.starts_from = f"encoder from {self.model.load_pretrained_parts()}"
+        self.trainlog = TrainingLog(self.out, resume_step=self.step)
         self._resumed_step, self._resumed_seconds = self.step, self.seconds
         self._started = time.monotonic()
         self._processor_started = time.process_time()
 
     def _restore(self, state: TrainingState) -> None:
         state.into(self.model, self.optimizer)
-        self.step, self.seconds = state.step, state.seconds
+        self.step, self.seconds, self.starts_from = state.step, state.seconds, state.starts_from
 
     def fraction(self) -> float:
         """Share of the run's budget that is spent."""
@@ -179,8 +190,9 @@ class _Run:
         jitter = generator_for(config.seed, self.step, "jitter")
 
         self.model.train()
-        latents = self.model.encode(patches)
-        levels = self.model.trace_levels(pixels.rays, latents, pixels.box, jitter)
+        with autocast(config.precision, self.device):
+            latents = self.model.encode(patches)
+            levels = self.model.trace_levels(pixels.rays, latents, pixels.box, jitter)
         renderings = tuple(composite(segments) for segments in levels)
         counts = pixels.is_known & to_canonical(pixels.rays, pixels.box).hit
         terms = training_loss(renderings, pixels.rgb, pixels.alpha, counts, config.loss)
@@ -222,10 +234,15 @@ class _Run:
             **self.provenance,
             "recipe": self.config.recipe,
             "training": dataclasses.asdict(self.config),
+            "precision": resolve_precision(self.config.precision, self.device),
+            "starts_from": self.starts_from,
             "step": self.step,
         }
         self.checksum = save_model(self.out, self.model, self.config.model, provenance)
-        save_state(self.out, TrainingState.of(self.model, self.optimizer, step=self.step, seconds=self.seconds))
+        state = TrainingState.of(
+            self.model, self.optimizer, step=self.step, seconds=self.seconds, starts_from=self.starts_from
+        )
+        save_state(self.out, state)
 
     def close(self) -> None:
         self.trainlog.close()
@@ -237,6 +254,7 @@ class _Run:
             seconds=round(self.seconds, 3),
             rays_per_s=round(self.rays_per_s, 1),
             psnr=round(self.psnr, 3),
-            encoder_start=self.encoder_start,
+            starts_from=self.starts_from,
+            precision=resolve_precision(self.config.precision, self.device),
             sha256=self.checksum,
         )
