@@ -130,7 +130,7 @@ def table(rows: list[dict[str, float | str]], device: torch.device, options: arg
         f"medians of {options.rounds} interleaved rounds; {options.rays} rays per patch and training step; ratio per "
         f"processor second; render: one {options.size} x {options.size} view, rays that miss the box included.",
         "",
-        "| recipe | trains in | train rays/s | train rays/CPU-s | ratio | render rays/s | render rays/CPU-s | step (MiB) |",
+        "| recipe | precision | train rays/s | per CPU-s | ratio | render rays/s | per CPU-s | step memory (MiB) |",
         "|---|---|---:|---:|---:|---:|---:|---:|",
     ]
     for found in rows:
