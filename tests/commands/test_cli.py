@@ -57,6 +57,30 @@ def test_evaluate_writes_rows_and_prints_json(trained: Path, capsys: pytest.Capt
     assert "lpips" in json.loads((trained / "rows.header.json").read_text())["reasons"]
 
 
+def test_report_scores_both_protocols_on_one_page(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = trained / "report"
+    command = ["report", str(trained / "run"), "--data", str(trained / "data"), "--out", str(out), "--split", "None"]
+    assert run([*command, "--turntables", "1", "--device", "cpu", "--json"]) == 0
+    protocols = {found["protocol"]: found["num_images"] for found in json.loads(capsys.readouterr().out)["summary"]}
+    assert protocols == {"novel-view": 9, "input-view": 9}
+    assert len((out / "novel-view.jsonl").read_text().splitlines()) == 9
+    page = (out / "index.html").read_text()
+    assert "From photo to car" in page
+    heads, rows = read_image(out / "checks.png").shape[1] / read_image(out / "novel-views.png").shape[1], 9
+    assert heads == pytest.approx(6 / 5, abs=0.1)  # six pictures a row against five
+    assert read_image(out / "checks.png").shape[0] > rows * 100
+    assert len(list((out / "turntables").iterdir())) == 1
+
+
+def test_report_of_cars_seen_once_has_no_novel_views(trained: Path) -> None:
+    toy_store(trained / "once", cars=2, views=1)
+    out = trained / "report-once"
+    command = ["report", str(trained / "run"), "--data", str(trained / "once"), "--out", str(out), "--split", "None"]
+    assert run([*command, "--turntables", "1", "--device", "cpu", "--quiet"]) == 0
+    assert not (out / "novel-view.jsonl").exists()
+    assert "Novel views" not in (out / "index.html").read_text()
+
+
 def test_render_goes_round_the_car(trained: Path) -> None:
     out = trained / "views"
     command = ["render", str(trained / "run"), "--data", str(trained / "data"), "--patches", "toy-0-0"]
