@@ -66,9 +66,7 @@ def test_report_scores_both_protocols_on_one_page(trained: Path, capsys: pytest.
     assert len((out / "novel-view.jsonl").read_text().splitlines()) == 9
     page = (out / "index.html").read_text()
     assert "From photo to car" in page
-    heads, rows = read_image(out / "checks.png").shape[1] / read_image(out / "novel-views.png").shape[1], 9
-    assert heads == pytest.approx(6 / 5, abs=0.1)  # six pictures a row against five
-    assert read_image(out / "checks.png").shape[0] > rows * 100
+    assert read_image(out / "checks.png").shape[0] > 9 * 100  # nine rows of pictures
     assert len(list((out / "turntables").iterdir())) == 1
 
 
