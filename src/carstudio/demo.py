@@ -29,7 +29,7 @@ class DemoConfig:
     out: Path
     cars: int = 200
     views: int = 12
-    minutes: float = 5.0
+    minutes: float = 6.0
     seed: int = 0
     device: str = "auto"
 

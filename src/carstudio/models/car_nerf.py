@@ -49,8 +49,6 @@ class CarNeRFConfig:
     """LayerNorm on both codes (small recipes: keeps a young encoder from drowning the position)."""
     colour_skip_px: int = 0
     """Side of a tiny copy of the masked crop, added to the texture code by a linear map; 0: none, as the paper."""
-    palette: int = 0
-    """Colours per car, linear in the texture code, that the colour head may add before its sigmoid; 0: none (paper)."""
     encode_pose: bool = False
     """Tell the encoder the car's pose in the camera and its size (not in the paper; known wherever there is a box)."""
 
@@ -135,9 +133,6 @@ class CarNeRFField(nn.Module):
         self.direction_in = nn.Linear(direction_size, width)
         self.colour_hidden = nn.Linear(width, width // 2)
         self.colour_out = nn.Linear(width // 2, 3)
-        if config.palette:
-            self.palette = nn.Linear(code, 3 * config.palette)
-            self.palette_shares = nn.Linear(width // 2, config.palette)
 
     def forward(
         self, gaussians: Gaussians, view_directions: Float[Tensor, "batch ray 3"], latents: Latents
@@ -148,16 +143,7 @@ class CarNeRFField(nn.Module):
         direction = self.direction_in(self._encode_direction(view_directions))[:, :, None]
         colour = self.colour_in(hidden) + (direction + self.texture_in(latents.texture)[:, None, None])
         colour = torch.relu(self.colour_hidden(torch.relu(colour)))
-        logits = self.colour_out(colour)
-        if self.config.palette:
-            logits = logits + self._palette_colour(colour, latents.texture)
-        return density, torch.sigmoid(logits)
-
-    def _palette_colour(
-        self, hidden: Float[Tensor, "batch ray sample feature"], texture: Float[Tensor, "batch code"]
-    ) -> Float[Tensor, "batch ray sample 3"]:
-        colours = self.palette(texture).unflatten(-1, (self.config.palette, 3))
-        return torch.einsum("brsp,bpc->brsc", self.palette_shares(hidden), colours)
+        return density, torch.sigmoid(self.colour_out(colour))
 
     def _trunk(
         self, position: Float[Tensor, "batch ray sample feature"], shape: Float[Tensor, "batch 1 1 code"]
