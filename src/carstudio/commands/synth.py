@@ -1,6 +1,6 @@
 """`carstudio synth`: photographs of synthetic cars with exact truth, as a CarPatch3D store."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 from carstudio.commands.build import describe
 from carstudio.commands.command import Outcome, Output, plain
@@ -13,6 +13,7 @@ class Synth(Output, SynthConfig):
 
     def run(self) -> Outcome:
         """Render and write the store."""
+        config = SynthConfig(**{field.name: getattr(self, field.name) for field in fields(SynthConfig)})
         with self.progress() as report:
-            summary = synthesize(self, report)
+            summary = synthesize(config, report)
         return Outcome(describe(summary), plain(summary))
