@@ -4,6 +4,8 @@ Each step leaves its result in the demo's folder and is skipped when that is the
 """
 
 import shlex
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -73,10 +75,17 @@ class DemoConfig:
         return [*lines, f"carstudio render {run} --data {data} --out {shlex.quote(str(self.out / 'render'))}"]
 
 
-def run_demo(config: DemoConfig, report: Report = silent) -> dict[str, Any]:
-    """Do what is not done yet and write `index.html`; returns the novel-view figures of the unseen cars."""
+Stops = Callable[[], AbstractContextManager[Callable[[], bool]]]
+
+
+def run_demo(config: DemoConfig, report: Report = silent, stops: Stops | None = None) -> dict[str, Any]:
+    """Do what is not done yet and write `index.html`; returns the novel-view figures of the unseen cars.
+
+    `stops()` is entered around the training and gives the `should_stop` that it asks after every step.
+    """
     store = _photograph(config, report)
-    summary = _train(config, store, report)
+    with stops() if stops is not None else nullcontext(lambda: False) as should_stop:
+        summary = _train(config, store, report, should_stop)
     model = load_model(config.run, device=pick_device(config.device))
     rows, views = _score(config, model, store, report)
     turned = _turn(config, model, store, report)
@@ -94,7 +103,7 @@ def _photograph(config: DemoConfig, report: Report) -> PatchStore:
     return open_store(config.data)
 
 
-def _train(config: DemoConfig, store: PatchStore, report: Report) -> dict[str, Any]:
+def _train(config: DemoConfig, store: PatchStore, report: Report, should_stop: Callable[[], bool]) -> dict[str, Any]:
     done = config.run / "summary.json"
     if done.exists():
         return dict(read_json(done))
@@ -109,6 +118,7 @@ def _train(config: DemoConfig, store: PatchStore, report: Report) -> dict[str, A
         on_save=lambda model, step: views_panel(
             model, store, config.run / "pictures" / f"step-{step:07d}.png", "instance", 4
         ),
+        should_stop=should_stop,
     )
     write_json(done, asdict(summary))
     return asdict(summary)

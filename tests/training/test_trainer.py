@@ -9,41 +9,12 @@ import torch
 from carstudio.dataset.store import PatchStore
 from carstudio.errors import InputError
 from carstudio.evaluation.protocols import EvaluationConfig, score_views, view_pairs
-from carstudio.models.car_nerf import CarNeRFConfig
-from carstudio.models.encoders import EncoderConfig
 from carstudio.models.interface import CategoryModel
-from carstudio.rendering.field import SamplingConfig
 from carstudio.training.checkpoint import describe_model, load_model
 from carstudio.training.log import read_log
-from carstudio.training.losses import LossConfig
 from carstudio.training.schedule import ScheduleConfig, learning_rate
-from carstudio.training.trainer import TrainConfig, train
-from training.toy import toy_store
-
-TINY = TrainConfig(
-    recipe="tiny",
-    model=CarNeRFConfig(
-        encoder=EncoderConfig(kind="small", side_px=32, pretrained=None, num_features=32, sees_mask=True),
-        sampling=SamplingConfig(coarse=16, fine=0),
-        width=32,
-        depth=3,
-        skip_after=None,
-        code_size=16,
-        position_frequencies=4,
-        direction_frequencies=1,
-        normalise_codes=True,
-        colour_skip_px=4,
-    ),
-    loss=LossConfig(colour="whole-crop"),
-    schedule=ScheduleConfig(first=1e-2, last=1e-3, decay_steps=None),
-    supervision="mixed",
-    patches_per_step=6,
-    rays_per_patch=64,
-    steps=12,
-    split=None,
-    log_every=2,
-    save_every=4,
-)
+from carstudio.training.trainer import train
+from training.toy import TINY, toy_store
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from carstudio.commands.command import Outcome, Output
+from carstudio.commands.stopping import noted_stops
 from carstudio.demo import DemoConfig, run_demo
 from carstudio.errors import InputError
 
@@ -26,6 +27,10 @@ class Demo(Output):
     device: str = "auto"
     """auto, cpu, cuda, mps, ..."""
 
+    def saved(self) -> str:
+        """The steps, and the training's last checkpoint."""
+        return f"what is finished in {self.out} is kept and not done again"
+
     def run(self) -> Outcome:
         """Run the path; what an earlier call finished is not done again."""
         if self.cars < 4 or self.views < 2:
@@ -35,7 +40,7 @@ class Demo(Output):
             out=self.out, cars=self.cars, views=self.views, minutes=self.minutes, seed=self.seed, device=self.device
         )
         with self.progress() as report:
-            result = run_demo(config, report)
+            result = run_demo(config, report, noted_stops)
         seconds = time.monotonic() - started
         text = (
             f"cars never seen, novel view: PSNR {result['psnr']:.2f} dB, SSIM {result['ssim']:.3f}, "

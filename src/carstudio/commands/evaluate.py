@@ -38,6 +38,10 @@ class Evaluate(Output):
     device: str = "auto"
     """auto, cpu, cuda, mps, ..."""
 
+    def saved(self) -> str:
+        """Rows are written together when all images are scored."""
+        return "no row was written: they are written together at the end"
+
     def run(self) -> Outcome:
         """Score, write rows and header, and print the table."""
         model = load_model(self.model, device=pick_device(self.device))

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, fields
 
-from carstudio.commands.build import describe
+from carstudio.commands.build import describe, describe_unfinished
 from carstudio.commands.command import Outcome, Output, plain
 from carstudio.dataset.sources.synthetic import SynthConfig, synthesize
 
@@ -10,6 +10,10 @@ from carstudio.dataset.sources.synthetic import SynthConfig, synthesize
 @dataclass(frozen=True, kw_only=True)
 class Synth(Output, SynthConfig):
     """Photographs of synthetic cars (or of the GLB meshes in --meshes) with exact mask, depth, box and camera."""
+
+    def saved(self) -> str:
+        """The whole shards."""
+        return describe_unfinished(self.out)
 
     def run(self) -> Outcome:
         """Render and write the store."""

@@ -197,7 +197,13 @@ def _is_foreign(path: Path) -> bool:
 
 def describe_shard(path: Path) -> Shard:
     """Name, rows and checksum of a shard on disk."""
-    return Shard(path.name, pq.read_metadata(path).num_rows, sha256_file(path))
+    return Shard(path.name, count_patches(path), sha256_file(path))
+
+
+def count_patches(shard: Path) -> int:
+    """Patches in a shard on disk, from its last bytes."""
+    num_rows: int = pq.read_metadata(shard).num_rows
+    return num_rows
 
 
 def _patch_ids(shard: Path) -> list[str]:
