@@ -45,10 +45,11 @@ def main() -> None:
 def run(arguments: list[str], watch: StopWatch | None = None) -> int:
     """Parse and run one command line; returns the exit code."""
     watch = watch or StopWatch()
+    watch.farewell = lambda: f"interrupted; nothing was written\n{go_on_with(arguments)}"
     try:
         return _run(arguments, watch)
     except KeyboardInterrupt as stop:
-        watch.say(watch.farewell())
+        watch.say_goodbye(lambda text: print(text, file=sys.stderr, flush=True))
         return 128 + (stop.signal if isinstance(stop, Interrupted) else signal.SIGINT)
 
 
@@ -67,7 +68,13 @@ def _run(arguments: list[str], watch: StopWatch) -> int:
         return 2
     command = parse(verb, rest)
     watch.farewell = lambda: f"interrupted; {how_to_go_on(command, arguments)}"
-    return execute(command, arguments)
+    watch.raise_stops()
+    try:
+        return execute(command)
+    except Exception as error:
+        if watch.stopped_by is not None:  # a library has made something else of our `Interrupted`
+            raise Interrupted(watch.stopped_by) from error
+        return explain(error, command, arguments)
 
 
 def parse(verb: str, options: list[str]) -> "Output":
@@ -85,31 +92,28 @@ def parse(verb: str, options: list[str]) -> "Output":
     return command
 
 
-def execute(command: "Output", arguments: list[str]) -> int:
-    """Run a parsed verb, print its outcome, and turn errors into one message and an exit code."""
+def execute(command: "Output") -> int:
+    """Run a parsed verb and print its outcome."""
+    outcome = command.run()
     try:
-        outcome = command.run()
         print(json.dumps(outcome.value, indent=2) if command.json else outcome.text, flush=True)
-    except StorageError as error:
-        print(f"error: {error}\n{how_to_go_on(command, arguments)}", file=sys.stderr)
-        return 2
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     except BrokenPipeError:  # nobody reads on (`| head`): what could be said to whom?
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the buffer's rest goes there at the end
-        return 0
-    except OSError as error:
-        if error.errno is None:  # not the system's but some library's
-            return our_fault(arguments)
+    return 0
+
+
+def explain(error: Exception, command: "Output", arguments: list[str]) -> int:
+    """One message for what ended a verb; returns the exit code."""
+    if isinstance(error, StorageError) or (isinstance(error, OSError) and error.errno is not None):
         print(f"error: {error}\n{how_to_go_on(command, arguments)}", file=sys.stderr)
         return 2
-    except FloatingPointError as error:  # a training whose numbers ran away: no bug, yet no input either
+    if isinstance(error, InputError):
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    if isinstance(error, FloatingPointError):  # a training whose numbers ran away: no bug, yet no input either
         print(f"error: {error}", file=sys.stderr)
         return 1
-    except Exception:
-        return our_fault(arguments)
-    return 0
+    return our_fault(error, arguments)
 
 
 def how_to_go_on(command: "Output", arguments: list[str]) -> str:
@@ -118,12 +122,17 @@ def how_to_go_on(command: "Output", arguments: list[str]) -> str:
         saved = command.saved()
     except Exception:  # never a second error on top of the first
         saved = "what was finished is saved"
-    return f"{saved}\ngo on with: {shlex.join(['carstudio', *command.again(arguments)])}"
+    return f"{saved}\n{go_on_with(command.again(arguments))}"
 
 
-def our_fault(arguments: list[str]) -> int:
-    """Say that the exception being handled is a bug of this program; exit code 1."""
-    traceback.print_exc()
+def go_on_with(arguments: list[str]) -> str:
+    """The line with the command to copy."""
+    return f"go on with: {shlex.join(['carstudio', *arguments])}"
+
+
+def our_fault(error: Exception, arguments: list[str]) -> int:
+    """Say that an exception is a bug of this program; exit code 1."""
+    traceback.print_exception(error)
     print(
         f"\nThis is a fault of carstudio {__version__}, not of yours. Please report it with the lines above and the "
         f"command:\n  {shlex.join(['carstudio', *arguments])}",

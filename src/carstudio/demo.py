@@ -5,7 +5,6 @@ Each step leaves its result in the demo's folder and is skipped when that is the
 
 import shlex
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,6 +29,7 @@ from carstudio.report.panels import encode_patch, turntable, views_panel, views_
 from carstudio.report.plots import learning_curve
 from carstudio.report.sheets import fit
 from carstudio.report.video import write_gif
+from carstudio.signals import held_back_stops
 from carstudio.training.checkpoint import describe_model, load_model, pick_device
 from carstudio.training.log import read_log
 from carstudio.training.trainer import TrainSummary, train
@@ -75,17 +75,11 @@ class DemoConfig:
         return [*lines, f"carstudio render {run} --data {data} --out {shlex.quote(str(self.out / 'render'))}"]
 
 
-Stops = Callable[[], AbstractContextManager[Callable[[], bool]]]
-
-
-def run_demo(config: DemoConfig, report: Report = silent, stops: Stops | None = None) -> dict[str, Any]:
-    """Do what is not done yet and write `index.html`; returns the novel-view figures of the unseen cars.
-
-    `stops()` is entered around the training and gives the `should_stop` that it asks after every step.
-    """
+def run_demo(config: DemoConfig, report: Report = silent) -> dict[str, Any]:
+    """Do what is not done yet and write `index.html`; returns the novel-view figures of the unseen cars."""
     store = _photograph(config, report)
-    with stops() if stops is not None else nullcontext(lambda: False) as should_stop:
-        summary = _train(config, store, report, should_stop)
+    with held_back_stops() as stops:
+        summary = _train(config, store, report, lambda: bool(stops))
     model = load_model(config.run, device=pick_device(config.device))
     rows, views = _score(config, model, store, report)
     turned = _turn(config, model, store, report)

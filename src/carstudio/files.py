@@ -25,10 +25,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     path = Path(path)
     partial: Path | None = None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=f".partial{path.suffix}", dir=path.parent)
-        partial = Path(name)
-        os.close(handle)
+        partial = _new_partial(path)
         yield partial
         with partial.open("rb+") as file:
             os.fsync(file.fileno())
@@ -37,10 +34,26 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     except OSError as error:
         if isinstance(error.filename, str) and Path(error.filename).parent not in path.parents:
             raise  # about another file, which the block was reading
-        raise StorageError(path, error.strerror or error) from error
+        raise StorageError(path, os.strerror(error.errno) if error.errno else error) from error
     finally:
         if partial is not None:
             partial.unlink(missing_ok=True)
+
+
+def require_writable(path: Path | str) -> None:
+    """`StorageError` now rather than after an hour's work when a file could not be made at `path`."""
+    try:
+        _new_partial(Path(path)).unlink()
+    except OSError as error:
+        raise StorageError(path, error.strerror) from error
+
+
+def _new_partial(path: Path) -> Path:
+    """An empty file with a temporary name beside `path`, whose folder is made when it is missing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=f".partial{path.suffix}", dir=path.parent)
+    os.close(handle)
+    return Path(name)
 
 
 def remove_partials(folder: Path | str) -> None:

@@ -36,7 +36,7 @@ class FolderLock:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._acquire()
         except OSError as error:
-            raise StorageError(self._path, error.strerror or error) from error
+            raise StorageError(self.folder, error.strerror or error) from error
 
     @property
     def is_held(self) -> bool:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from carstudio.commands.command import Outcome, Output
-from carstudio.commands.stopping import noted_stops
 from carstudio.demo import DemoConfig, run_demo
 from carstudio.errors import InputError
 
@@ -40,7 +39,7 @@ class Demo(Output):
             out=self.out, cars=self.cars, views=self.views, minutes=self.minutes, seed=self.seed, device=self.device
         )
         with self.progress() as report:
-            result = run_demo(config, report, noted_stops)
+            result = run_demo(config, report)
         seconds = time.monotonic() - started
         text = (
             f"cars never seen, novel view: PSNR {result['psnr']:.2f} dB, SSIM {result['ssim']:.3f}, "

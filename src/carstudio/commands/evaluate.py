@@ -14,6 +14,7 @@ from carstudio.evaluation.protocols import EvaluationConfig, Protocol, result_ro
 from carstudio.evaluation.results import ResultHeader, write_rows
 from carstudio.evaluation.summary import summarise
 from carstudio.evaluation.tables import result_tables, to_markdown
+from carstudio.files import require_writable
 from carstudio.training.checkpoint import describe_model, load_model, pick_device
 
 
@@ -49,6 +50,7 @@ class Evaluate(Output):
         store = open_store(self.data)
         config = EvaluationConfig(protocol=self.protocol, limit=self.limit, seed=self.seed, **parse_split(self.split))
         pairs = view_pairs(store, config)
+        require_writable(self.out)
         lpips, reason = load_lpips()
         with self.progress() as report:
             rows = [

@@ -7,11 +7,11 @@ from typing import Annotated
 import tyro
 
 from carstudio.commands.command import Outcome, Output, plain, provenance
-from carstudio.commands.stopping import noted_stops
 from carstudio.dataset.store import PatchStore, open_store
 from carstudio.models.interface import CategoryModel
 from carstudio.recipes import recipe
 from carstudio.report.panels import views_panel
+from carstudio.signals import held_back_stops
 from carstudio.training.batches import Supervision
 from carstudio.training.resume import has_state, saved_step
 from carstudio.training.trainer import TrainConfig, train
@@ -72,7 +72,7 @@ class Train(Output):
             if self.pictures:
                 views_panel(model, store, self.out / "pictures" / f"step-{step:07d}.png", self.split, self.pictures)
 
-        with self.progress() as report, noted_stops() as should_stop:
+        with self.progress() as report, held_back_stops() as stops:
             summary = train(
                 self.config(),
                 store,
@@ -83,7 +83,7 @@ class Train(Output):
                 provenance={**provenance(), **store_origin(store)},
                 report=report,
                 on_save=draw,
-                should_stop=should_stop,
+                should_stop=lambda: bool(stops),
             )
         text = (
             f"{self.recipe}: {summary.steps} steps in {summary.seconds:.0f} s ({summary.rays_per_s:,.0f} rays/s), "

@@ -20,6 +20,7 @@ import cv2
 import torch
 
 from carstudio.errors import InputError
+from carstudio.signals import STOP_SIGNALS, held_back_stops
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -47,7 +48,8 @@ def ordered_map(
                 yield from waiting.popleft().result()
     except BrokenProcessPool as error:
         raise InputError(
-            "a worker process was ended from outside, for want of memory perhaps; fewer --workers need less of it"
+            "a worker process was ended from outside, for want of memory perhaps; the same command goes on from the "
+            "shards that are saved, and fewer --workers need less memory"
         ) from error
 
 
@@ -68,16 +70,18 @@ def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
 
 
 def _submit(pool: ProcessPoolExecutor, work: Callable[[Item], Result], items: Sequence[Item]) -> Future[list[Result]]:
-    """Hand out work; a worker that starts for it inherits that the stop signals are blocked."""
-    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, _STOP_SIGNALS) if hasattr(signal, "pthread_sigmask") else None
-    try:
-        return pool.submit(_run, work, items)
-    finally:
-        if blocked is not None:
-            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+    """Hand out work; a worker that starts for it inherits that the stop signals are blocked.
 
-
-_STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+    They are held back as well, so that no worker is started without the pool knowing of it.
+    """
+    with held_back_stops():
+        can_block = hasattr(signal, "pthread_sigmask")
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS) if can_block else set()
+        try:
+            return pool.submit(_run, work, items)
+        finally:
+            if can_block:
+                signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _run(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
