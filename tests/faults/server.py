@@ -111,7 +111,7 @@ def run(request: Request) -> Ended:
         seconds=ended - started,
         after_signal_s=None if signalled is None else ended - signalled,
         orphans_s=orphans_s,
-        operations=int(count.read_text()) if count.exists() else 0,
+        operations=int(count.read_text() or 0) if count.exists() else 0,
     )
 
 
