@@ -4,6 +4,7 @@ Each step leaves its result in the demo's folder and is skipped when that is the
 """
 
 import shlex
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from carstudio.progress import Report, silent
 from carstudio.recipes import recipe
 from carstudio.report.panels import views_panel
 from carstudio.report.run_page import RunPageConfig, write_run_page
+from carstudio.signals import held_back_stops
 from carstudio.training.trainer import TrainSummary, train
 
 SCORED_IMAGES = 120
@@ -57,7 +59,8 @@ class DemoConfig:
 def run_demo(config: DemoConfig, report: Report = silent) -> dict[str, Any]:
     """Do what is not done yet and write `index.html`; returns the novel-view figures of the unseen cars."""
     store = _photograph(config, report)
-    summary = _train(config, store, report)
+    with held_back_stops() as stops:
+        summary = _train(config, store, report, lambda: bool(stops))
     summaries = write_run_page(
         config.run,
         store,
@@ -85,7 +88,7 @@ def _photograph(config: DemoConfig, report: Report) -> PatchStore:
     return open_store(config.data)
 
 
-def _train(config: DemoConfig, store: PatchStore, report: Report) -> dict[str, Any]:
+def _train(config: DemoConfig, store: PatchStore, report: Report, should_stop: Callable[[], bool]) -> dict[str, Any]:
     done = config.run / "summary.json"
     if done.exists():
         return dict(read_json(done))
@@ -100,6 +103,7 @@ def _train(config: DemoConfig, store: PatchStore, report: Report) -> dict[str, A
         on_save=lambda model, step: views_panel(
             model, store, config.run / "pictures" / f"step-{step:07d}.png", "instance", 4
         ),
+        should_stop=should_stop,
     )
     write_json(done, asdict(summary))
     return asdict(summary)

@@ -1,11 +1,20 @@
 """The command line as a user meets it: whole runs on a toy store, exit codes, messages."""
 
+import errno
 import json
+import math
+import os
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 
+import carstudio.training.trainer
 from carstudio.cli import VERBS, run
+from carstudio.errors import Interrupted, StorageError
 from carstudio.images import read_image
 from training.toy import toy_store
 
@@ -117,6 +126,94 @@ def test_the_users_errors_are_one_message_and_exit_code_2(
     assert message in shown
     assert shown.startswith("error: ")
     assert "Traceback" not in shown
+
+
+def ends_with(error: BaseException, monkeypatch: pytest.MonkeyPatch, trained: Path) -> int:
+    """Exit code of a verb whose work raises `error`."""
+
+    def fail(path: Path) -> None:
+        raise error
+
+    monkeypatch.setattr("carstudio.commands.dataset.open_store", fail)
+    return run(["dataset", "info", str(trained / "data")])
+
+
+def test_our_own_faults_keep_their_traceback_and_ask_for_a_report(
+    trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert ends_with(KeyError("colour"), monkeypatch, trained) == 1
+    shown = capsys.readouterr().err
+    assert "in fail" in shown
+    assert "KeyError: 'colour'" in shown
+    assert "a fault of carstudio" in shown
+    assert f"carstudio dataset info {trained / 'data'}" in shown
+
+
+def test_numbers_that_ran_away_are_told_without_a_traceback(
+    trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("carstudio.training.trainer.masked_psnr", lambda *arguments: 1.0)
+    real = carstudio.training.trainer.training_loss
+
+    def poisoned(*arguments: Any) -> dict[str, torch.Tensor]:
+        return {name: term * math.nan for name, term in real(*arguments).items()}
+
+    monkeypatch.setattr("carstudio.training.trainer.training_loss", poisoned)
+    command = ["train", "car-nerf-small", "--data", str(trained / "data"), "--out", str(trained / "nan"), *TRAIN]
+    assert run(command) == 1
+    shown = capsys.readouterr().err
+    assert shown.startswith("error: step 0: loss term ")
+    assert "is nan for cars ['toy-" in shown
+    assert "resume with another --seed" in shown
+    assert "Traceback" not in shown
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (OSError(errno.EIO, "Input/output error", "/mnt/disk/manifest.json"), "'/mnt/disk/manifest.json'"),
+        (StorageError("rows.jsonl", "No space left on device"), "rows.jsonl: cannot be written (No space left"),
+    ],
+)
+def test_what_the_system_refuses_is_one_message(
+    error: Exception,
+    message: str,
+    trained: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert ends_with(error, monkeypatch, trained) == 2
+    first, saved, again = capsys.readouterr().err.splitlines()
+    assert message in first
+    assert saved == "nothing was written"
+    assert again == f"go on with: carstudio dataset info {trained / 'data'}"
+
+
+@pytest.mark.parametrize(("error", "code"), [(KeyboardInterrupt(), 130), (Interrupted(15), 143)])
+def test_an_interruption_has_its_own_exit_code(
+    error: BaseException,
+    code: int,
+    trained: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert ends_with(error, monkeypatch, trained) == code
+    assert capsys.readouterr().err.startswith("interrupted; nothing was written\ngo on with: carstudio dataset info ")
+
+
+def test_a_reader_that_leaves_is_no_error(trained: Path) -> None:
+    program = "from carstudio.cli import main; main()"
+    reader, writer = os.pipe()
+    os.close(reader)
+    ended = subprocess.run(
+        [sys.executable, "-c", program, "dataset", "info", str(trained / "data")],
+        stdout=writer,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    os.close(writer)
+    assert (ended.returncode, ended.stderr) == (0, "")
 
 
 def test_dataset_info_and_verify(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -26,6 +26,10 @@ class Demo(Output):
     device: str = "auto"
     """auto, cpu, cuda, mps, ..."""
 
+    def saved(self) -> str:
+        """The steps, and the training's last checkpoint."""
+        return f"what is finished in {self.out} is kept and not done again"
+
     def run(self) -> Outcome:
         """Run the path; what an earlier call finished is not done again."""
         if self.cars < 4 or self.views < 2:

@@ -13,6 +13,7 @@ from carstudio.evaluation.protocols import EvaluationConfig, Protocol
 from carstudio.evaluation.scored_run import score_run
 from carstudio.evaluation.summary import summarise
 from carstudio.evaluation.tables import result_tables, to_markdown
+from carstudio.files import require_writable
 from carstudio.training.checkpoint import describe_model, load_model, pick_device
 
 
@@ -37,10 +38,15 @@ class Evaluate(Output):
     device: str = "auto"
     """auto, cpu, cuda, mps, ..."""
 
+    def saved(self) -> str:
+        """Rows are written together when all images are scored."""
+        return "no row was written: they are written together at the end"
+
     def run(self) -> Outcome:
         """Score, write rows and header, and print the table."""
         model, description = load_model(self.model, device=pick_device(self.device)), describe_model(self.model)
         config = EvaluationConfig(protocol=self.protocol, limit=self.limit, seed=self.seed, **parse_split(self.split))
+        require_writable(self.out)
         with self.progress() as report:
             scored = score_run(
                 model, description, open_store(self.data), config, command=provenance()["command"], report=report

@@ -24,6 +24,10 @@ class WriteReport(Output):
     page: tyro.conf.OmitArgPrefixes[RunPageConfig] = field(default_factory=RunPageConfig)
     """What is scored and shown."""
 
+    def saved(self) -> str:
+        """The page comes last."""
+        return "no page was written: it is written at the end"
+
     def run(self) -> Outcome:
         """Score, draw and write."""
         with self.progress() as report:

@@ -11,7 +11,9 @@ from carstudio.dataset.store import PatchStore, open_store
 from carstudio.models.interface import CategoryModel
 from carstudio.recipes import recipe
 from carstudio.report.panels import views_panel
+from carstudio.signals import held_back_stops
 from carstudio.training.batches import Supervision
+from carstudio.training.resume import has_state, saved_step
 from carstudio.training.trainer import TrainConfig, train
 
 
@@ -53,6 +55,15 @@ class Train(Output):
             config = replace(config, supervision=self.supervision)
         return config
 
+    def saved(self) -> str:
+        """The step to go on from."""
+        return describe_checkpoint(self.out)
+
+    def again(self, arguments: list[str]) -> list[str]:
+        """With --resume, once there is a checkpoint."""
+        is_asked = "--resume" in arguments or not has_state(self.out)
+        return arguments if is_asked else [*arguments, "--resume"]
+
     def run(self) -> Outcome:
         """Train; pictures of unseen cars go to OUT/pictures."""
         store = open_store(self.data)
@@ -61,7 +72,7 @@ class Train(Output):
             if self.pictures:
                 views_panel(model, store, self.out / "pictures" / f"step-{step:07d}.png", self.split, self.pictures)
 
-        with self.progress() as report:
+        with self.progress() as report, held_back_stops() as stops:
             summary = train(
                 self.config(),
                 store,
@@ -72,6 +83,7 @@ class Train(Output):
                 provenance={**provenance(), **store_origin(store)},
                 report=report,
                 on_save=draw,
+                should_stop=lambda: bool(stops),
             )
         text = (
             f"{self.recipe}: {summary.steps} steps in {summary.seconds:.0f} s ({summary.rays_per_s:,.0f} rays/s), "
@@ -79,6 +91,12 @@ class Train(Output):
             f"model in {self.out}"
         )
         return Outcome(text, plain(summary))
+
+
+def describe_checkpoint(run: Path) -> str:
+    """What a stopped training leaves."""
+    step = saved_step(run) if has_state(run) else None
+    return f"no checkpoint is there yet in {run}" if step is None else f"step {step} is saved in {run}"
 
 
 def store_origin(store: PatchStore) -> dict[str, str]:

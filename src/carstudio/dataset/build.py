@@ -6,29 +6,24 @@ build goes on where it stopped when it is started again with the same settings.
 
 import hashlib
 import json
-import multiprocessing
 import os
 import time
-from collections import deque
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-import cv2
-import torch
-
 from carstudio.dataset.candidates import FrameResult, records_of_frame
 from carstudio.dataset.filters import FilterRecipe, judge
-from carstudio.dataset.runs import write_run
+from carstudio.dataset.runs import is_made_already, write_run
 from carstudio.dataset.sources.frame import FrameRef, Source
 from carstudio.dataset.sources.kitti_det import open_kitti_det
 from carstudio.dataset.sources.kitti_mot import open_kitti_mot
-from carstudio.dataset.splits import write_splits
+from carstudio.dataset.splits import count_parts, write_splits
 from carstudio.dataset.store import PatchStore, StoreWriter, open_store
 from carstudio.dataset.summary import BuildSummary, count_reasons
 from carstudio.dataset.verdicts import Verdict
+from carstudio.dataset.workers import ordered_map
 from carstudio.errors import InputError
 from carstudio.perception.results import Segmenter
 from carstudio.perception.specs import make_segmenter
@@ -90,6 +85,9 @@ class FrameJob:
 def build(config: BuildConfig, report: Report = silent) -> BuildSummary:
     """Make the store `config.out`; verdicts and splits are written at the end."""
     start = time.perf_counter()
+    if is_made_already(config.out, asdict(config)):
+        store = open_store(config.out)
+        return summarize(store, source=config.source, verdicts=store.verdicts())
     source = open_source(config)
     segmenter = make_segmenter(config.segmenter)
     refs = source.frames()
@@ -98,14 +96,14 @@ def build(config: BuildConfig, report: Report = silent) -> BuildSummary:
     with StoreWriter(config.out, source=source.name, resume_key=_resume_key(config)) as writer:
         write_run(config.out, asdict(config))
         job = FrameJob(source, segmenter, config.types, writer.ids())
-        for done, result in enumerate(_run(job, refs, workers), start=1):
-            for record in result.records:
-                writer.append(record)
-            problems += result.problems
-            report("build", done, len(refs), f"{len(writer)} candidates")
-    store = open_store(config.out)
-    verdicts = judge_store(store, config.filters)
-    summary = summarize(store, source=source.name, verdicts=verdicts)
+        with closing(ordered_map(job, refs, workers=workers, chunk=_CHUNK)) as results:
+            for done, result in enumerate(results, start=1):
+                for record in result.records:
+                    writer.append(record)
+                problems += result.problems
+                report("build", done, len(refs), f"{len(writer)} candidates")
+        verdicts = judge_and_split(writer, config.filters)
+    summary = summarize(open_store(config.out), source=source.name, verdicts=verdicts)
     return replace(summary, problems=tuple(problems), seconds=time.perf_counter() - start)
 
 
@@ -118,6 +116,18 @@ def open_source(config: BuildConfig) -> Source:
     return open_kitti_mot(config.root, sequence=config.sequence, frames=config.frames)
 
 
+def judge_and_split(writer: StoreWriter, recipe: FilterRecipe) -> list[Verdict]:
+    """Verdicts and splits of all that was written: before the writer closes, so that "finished" comes last.
+
+    A run killed before that is unfinished and goes on when it is started again.
+    """
+    writer.flush()
+    store = open_store(writer.path, lock=writer.lock)
+    verdicts = judge_store(store, recipe)
+    write_splits(store)
+    return verdicts
+
+
 def judge_store(store: PatchStore, recipe: FilterRecipe) -> list[Verdict]:
     """Judge every patch again by its stored values and replace the store's verdicts."""
     verdicts = [judge(record, recipe) for record in store.light_records()]
@@ -126,8 +136,7 @@ def judge_store(store: PatchStore, recipe: FilterRecipe) -> list[Verdict]:
 
 
 def summarize(store: PatchStore, *, source: str, verdicts: list[Verdict]) -> BuildSummary:
-    """Write the splits over the kept patches and count everything."""
-    splits = write_splits(store)
+    """Count everything in a finished store."""
     info = store.info()
     return BuildSummary(
         out=store.path,
@@ -136,7 +145,7 @@ def summarize(store: PatchStore, *, source: str, verdicts: list[Verdict]) -> Bui
         kept=info["kept"],
         instances=info["kept_instances"],
         reasons=count_reasons(verdicts),
-        splits=splits,
+        splits={name: count_parts(store.split(name)) for name in store.split_names()},
     )
 
 
@@ -150,26 +159,3 @@ def _num_workers(workers: int, num_frames: int) -> int:
     if workers < 0:
         raise InputError(f"--workers must be 0 (one per core) or more, found {workers}")
     return min(workers or os.cpu_count() or 1, max(1, num_frames // 8))  # a process takes seconds to start
-
-
-def _run(job: FrameJob, refs: Sequence[FrameRef], workers: int) -> Iterator[FrameResult]:
-    """Results in the order of `refs`."""
-    if workers == 1:
-        yield from map(job, refs)
-        return
-    chunks = [refs[i : i + _CHUNK] for i in range(0, len(refs), _CHUNK)]
-    context = multiprocessing.get_context("spawn")  # torch and onnxruntime have threads: forking them is not safe
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        waiting: deque[Future[list[FrameResult]]] = deque()
-        for chunk in chunks:
-            waiting.append(pool.submit(_work, job, chunk))
-            if len(waiting) > 2 * workers:  # keeps memory bounded
-                yield from waiting.popleft().result()
-        while waiting:
-            yield from waiting.popleft().result()
-
-
-def _work(job: FrameJob, refs: Sequence[FrameRef]) -> list[FrameResult]:
-    cv2.setNumThreads(1)  # one process per core, one thread per process
-    torch.set_num_threads(1)
-    return [job(ref) for ref in refs]

@@ -14,7 +14,7 @@ from carstudio.evaluation.protocols import EvaluationConfig, Protocol, ScoredVie
 from carstudio.evaluation.scored_run import ScoredRun, score_run
 from carstudio.evaluation.summary import Summary, summarise
 from carstudio.evaluation.tables import result_tables, to_markdown
-from carstudio.files import write_text
+from carstudio.files import require_writable, write_text
 from carstudio.images import encode_png, to_uint8, write_png
 from carstudio.models.interface import CategoryModel
 from carstudio.progress import Report, silent
@@ -66,6 +66,7 @@ def write_run_page(
 ) -> list[Summary]:
     """Score a trained model and write `index.html`, rows, table and pictures into `out`; returns the summaries."""
     model, description = load_model(run, device=pick_device(config.device)), describe_model(run)
+    require_writable(out / "index.html")
     evaluations = [config.evaluation(protocol) for protocol in PROTOCOLS]
     command = shlex.join(["carstudio", "report", str(run), "--data", str(store.path)])
     scored = {

@@ -11,7 +11,7 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
-from carstudio.errors import InputError
+from carstudio.errors import InputError, StorageError
 from carstudio.files import atomic_path, read_json, sha256_file, write_json
 from carstudio.models.interface import CategoryModel
 from carstudio.models.zoo import ModelConfig, build_model, config_from_json, config_to_json
@@ -47,7 +47,10 @@ def save_tensors(path: Path, tensors: dict[str, torch.Tensor], metadata: dict[st
     """Write tensors as safetensors, atomically."""
     on_cpu = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     with atomic_path(path) as partial:
-        save_file(on_cpu, partial, metadata=metadata)
+        try:
+            save_file(on_cpu, partial, metadata=metadata)
+        except SafetensorError as error:  # it wraps what the system says
+            raise StorageError(path, error) from error
 
 
 def load_tensors(path: Path) -> dict[str, torch.Tensor]:
@@ -81,7 +84,8 @@ def load_model(path_or_name: Path | str, *, device: torch.device | str = "cpu") 
     tensors = load_tensors(folder / WEIGHTS)
     if sha256_file(folder / WEIGHTS) != description.sha256:
         raise InputError(
-            f"{folder / WEIGHTS}: sha256 differs from the one in {DESCRIPTION}; the two do not belong together"
+            f"{folder / WEIGHTS}: sha256 differs from the one in {DESCRIPTION}; the two do not belong together. "
+            "Where a kill cut a checkpoint off, `carstudio train ... --resume` writes both again"
         )
     model = build_model(description.config)
     load_weights(model, tensors, name=str(folder / WEIGHTS))

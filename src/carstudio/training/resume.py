@@ -53,6 +53,17 @@ def save_state(folder: Path, state: TrainingState) -> None:
     save_tensors(folder / STATE, state.tensors, metadata)
 
 
+def has_state(folder: Path) -> bool:
+    """Whether a run can be resumed."""
+    return (folder / STATE).exists()
+
+
+def saved_step(folder: Path) -> int:
+    """The step a run would go on from, read from the header alone."""
+    with safe_open(folder / STATE, "pt") as file:
+        return int((file.metadata() or {}).get("step", 0))
+
+
 def load_state(folder: Path) -> TrainingState:
     """Read the state of a run; `InputError` when there is none or it is broken."""
     path = folder / STATE

@@ -12,7 +12,9 @@ import torch
 
 from carstudio.dataset.pixels import PatchCache
 from carstudio.dataset.store import PatchStore
-from carstudio.errors import InputError
+from carstudio.errors import InputError, Interrupted
+from carstudio.files import remove_partials
+from carstudio.locks import LOCK_NAME, FolderLock
 from carstudio.models.car_nerf import CarNeRFConfig
 from carstudio.models.interface import CategoryModel
 from carstudio.models.zoo import ModelConfig, build_model
@@ -20,8 +22,8 @@ from carstudio.progress import Report, silent
 from carstudio.rendering.rays import to_canonical
 from carstudio.rendering.volume import composite
 from carstudio.training.batches import StepSampler, Supervision, generator_for
-from carstudio.training.checkpoint import load_weights_of, pick_device, save_model
-from carstudio.training.log import TrainingLog
+from carstudio.training.checkpoint import describe_model, load_weights_of, pick_device, save_model
+from carstudio.training.log import LOG, TrainingLog
 from carstudio.training.losses import LossConfig, masked_psnr, training_loss
 from carstudio.training.precision import Precision, autocast, resolve_precision
 from carstudio.training.resume import STATE, TrainingState, load_state, save_state
@@ -89,28 +91,61 @@ def train(
     provenance: dict[str, Any] | None = None,
     report: Report = silent,
     on_save: Callable[[CategoryModel, int], None] | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
 ) -> TrainSummary:
     """Train a model on a store's kept patches and leave it in `out` (model, log, state to resume from).
 
     `init` is a trained model of the same config whose weights the run starts from (a resumed run has its own).
-    `on_save(model, step)` is called after each checkpoint, for pictures. Killed at any moment and resumed, a run by
-    steps ends with the same bits on a CPU as an uninterrupted one.
+    `on_save(model, step)` is called after each checkpoint, for pictures. Once `should_stop()` is true, the state of the
+    finished step is saved and `Interrupted` raised. Killed at any moment and resumed, a run by steps ends with the same
+    bits on a CPU as an uninterrupted one (a run by minutes follows the clock). `out` is locked while it is written.
     """
     run = _Run(config, store, out, pick_device(device), provenance or {})
-    run.begin(resume=resume, init=init)
-    try:
-        while not run.is_done():
-            figures = run.one_step()
-            if run.step % config.log_every == 0 or run.is_done():
-                run.log(figures)
-            report("training", *run.progress(), f"PSNR {run.psnr:.2f} dB  {run.rays_per_s:,.0f} rays/s")
-            if run.step % config.save_every == 0 or run.is_done():
-                run.save()
-                if on_save is not None:
-                    on_save(run.model, run.step)
-    finally:
-        run.close()
+    refuse_wrong_start(out, resume=resume)
+    with FolderLock(out):
+        remove_partials(out)
+        run.begin(init=init)
+        try:
+            _steps(run, report, on_save or _draw_nothing, should_stop)
+        finally:
+            run.close()
     return run.summary()
+
+
+def _steps(
+    run: "_Run", report: Report, on_save: Callable[[CategoryModel, int], None], should_stop: Callable[[], bool]
+) -> None:
+    """From where the run stands to its end."""
+    is_done = run.is_done()
+    if is_done:
+        run.save()  # resumed at its end: the model may be that of an earlier step
+    if is_done or (run.step > 0 and run.step % run.config.save_every == 0):
+        on_save(run.model, run.step)  # a kill may have come between the checkpoint and its picture
+    while not is_done:
+        figures = run.one_step()
+        is_done = run.is_done()  # asked once per step: the clock runs on
+        if run.step % run.config.log_every == 0 or is_done:
+            run.log(figures)
+        report("training", *run.progress(), f"PSNR {run.psnr:.2f} dB  {run.rays_per_s:,.0f} rays/s")
+        if run.step % run.config.save_every == 0 or is_done:
+            run.save()
+            on_save(run.model, run.step)
+        if not is_done and should_stop():
+            run.save_state()
+            raise Interrupted
+
+
+def _draw_nothing(model: CategoryModel, step: int) -> None:
+    """The default of `on_save`."""
+
+
+def refuse_wrong_start(out: Path, *, resume: bool) -> None:
+    """`InputError` when there is a checkpoint and no --resume, or neither a checkpoint nor a sign of a run begun."""
+    if (out / STATE).exists():
+        if not resume:
+            raise InputError(f"{out} holds a run already; add --resume to go on with it, or choose another --out")
+    elif resume and not any((out / name).exists() for name in (LOCK_NAME, LOG)):
+        raise InputError(f"{out}: nothing to resume ({STATE} is missing); start without --resume")
 
 
 class _Run:
@@ -142,17 +177,16 @@ class _Run:
             seed=config.seed,
         )
 
-    def begin(self, *, resume: bool, init: Path | None) -> None:
-        """Put the first weights in place, open the log and start the clocks."""
-        if resume:
+    def begin(self, *, init: Path | None) -> None:
+        """Put the first weights in place (the last checkpoint's if there is one), open the log, start the clocks."""
+        if (self.out / STATE).exists():
             self._restore(load_state(self.out))
-        elif (self.out / STATE).exists():
-            raise InputError(f"{self.out} holds a run already; add --resume to go on with it, or choose another --out")
         elif init is not None:
             self.starts_from = load_weights_of(init, self.model, self.config.model)
         else:
             self.starts_from = f"encoder from {self.model.load_pretrained_parts()}"
         self.trainlog = TrainingLog(self.out, resume_step=self.step)
+        self.psnr = self.trainlog.last_row.get("psnr", math.nan)
         self._resumed_step, self._resumed_seconds = self.step, self.seconds
         self._started = time.monotonic()
         self._processor_started = time.process_time()
@@ -218,7 +252,9 @@ class _Run:
         if broken:
             raise FloatingPointError(
                 f"step {self.step}: loss term {broken[0]} is {figures[broken[0]]} for cars {list(instance_ids)}; "
-                f"the last checkpoint in {self.out} is sound: lower the learning rate and --resume"
+                f"the weights are not changed by it. The last checkpoint in {self.out} is sound, but going on from it "
+                "meets the same numbers again: resume with another --seed (other batches from there on), or start "
+                "with a lower learning rate or clipped gradients (recipes.py)"
             )
 
     def log(self, figures: dict[str, float]) -> None:
@@ -229,7 +265,7 @@ class _Run:
         self.trainlog.write(row)
 
     def save(self) -> None:
-        """The model for its users, then the state to resume from."""
+        """The model for its users and the log, then the state: what goes on from it finds the others there."""
         provenance = {
             **self.provenance,
             "recipe": self.config.recipe,
@@ -238,7 +274,12 @@ class _Run:
             "starts_from": self.starts_from,
             "step": self.step,
         }
-        self.checksum = save_model(self.out, self.model, self.config.model, provenance)
+        save_model(self.out, self.model, self.config.model, provenance)
+        self.save_state()
+
+    def save_state(self) -> None:
+        """What the run goes on from; the log reaches the disk before it."""
+        self.trainlog.sync()
         state = TrainingState.of(
             self.model, self.optimizer, step=self.step, seconds=self.seconds, starts_from=self.starts_from
         )
@@ -256,5 +297,5 @@ class _Run:
             psnr=round(self.psnr, 3),
             starts_from=self.starts_from,
             precision=resolve_precision(self.config.precision, self.device),
-            sha256=self.checksum,
+            sha256=describe_model(self.out).sha256,
         )
