@@ -219,3 +219,12 @@ def test_a_reader_that_leaves_is_no_error(trained: Path) -> None:
 def test_dataset_info_and_verify(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["dataset", "info", str(trained / "data"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["patches"] == 9
+
+
+def test_the_learning_rate_keeps_its_fall_to_a_share_of_the_first(trained: Path) -> None:
+    out = trained / "gentle"
+    command = ["train", "car-nerf-small", "--data", str(trained / "data"), "--out", str(out), *TRAIN]
+    assert run([*command, "--learning-rate", "1e-4", "--init", str(trained / "run")]) == 0
+    schedule = json.loads((out / "model.json").read_text())["provenance"]["training"]["schedule"]
+    assert schedule["first"] == 1e-4
+    assert schedule["last"] == pytest.approx(1e-4 / 50)  # the recipe falls from 5e-3 to 1e-4
