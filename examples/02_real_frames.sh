@@ -8,6 +8,7 @@
 # an earlier call finished is not done again. Two dozen frames hold too few views to learn a car's unseen sides from:
 # training starts from a model of many synthetic cars, the demo's.
 set -eu
+[ $# -ge 2 ] || { echo "usage: $0 KITTI/training OUT [SEQUENCE] [FRAMES] [SEGMENTER]" >&2; exit 2; }
 run=$(dirname -- "$0")/../run
 root=$1 out=$2 sequence=${3:-0001} frames=${4:-0-24} segmenter=${5:-grabcut}
 
