@@ -13,6 +13,7 @@ from types import TracebackType
 from typing import IO
 
 from carstudio.errors import InputError, StorageError
+from carstudio.files import make_folder
 
 try:
     import fcntl
@@ -33,7 +34,7 @@ class FolderLock:
         self._path = self.folder / LOCK_NAME
         self._file: IO[bytes] | None = None
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
+            make_folder(self.folder)
             self._acquire()
         except OSError as error:
             raise StorageError(self.folder, error.strerror or error) from error
