@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import IO
 
 from carstudio.errors import InputError, StorageError
-from carstudio.files import make_folder
+from carstudio.files import make_folder, remove_partials
 
 try:
     import fcntl
@@ -77,6 +77,12 @@ class FolderLock:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.release()
+
+
+def clear_leftovers(folder: Path | str) -> None:
+    """Remove what a killed writer left in a folder that is whole, unless somebody is writing or nobody may."""
+    with suppress(InputError), FolderLock(folder):
+        remove_partials(folder)
 
 
 def _lock(file: IO[bytes]) -> bool:

@@ -118,10 +118,11 @@ def test_a_finished_build_started_again_is_done_and_with_other_settings_refused(
     """A job killed between its last write and its end is started again by its batch system."""
     config = BuildConfig(source="kitti-mot", root=root, out=tmp_path / "s", workers=1)
     first = build(config)
-    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "s").rglob("*")}
+    before = {path: path.read_bytes() for path in (tmp_path / "s").rglob("*") if path.is_file()}
+    (tmp_path / "s" / ".lock").touch()
     again = build(replace(config, workers=2))
     assert replace(again, seconds=0.0) == replace(first, problems=(), seconds=0.0)
-    assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "s").rglob("*")}
+    assert before == {path: path.read_bytes() for path in (tmp_path / "s").rglob("*") if path.is_file()}
     for changes in ({"filters": FilterRecipe(depth_m=5.0)}, {"frames": "0-1"}):
         with pytest.raises(InputError, match="already holds a finished store"):
             build(replace(config, **changes))  # type: ignore[arg-type]
