@@ -20,7 +20,7 @@ from faults.kills import compare, make_reference
 from faults.server import Request
 from faults.targets import TARGETS, TRAIN, Target, files_of
 
-BUILD, SYNTH = TARGETS["build"][0], TARGETS["synth"][0]
+BUILD = TARGETS["build"][0]
 
 
 def arguments_of(verb: str, inputs: Path, trained: Path, out: Path) -> list[str]:
@@ -79,7 +79,7 @@ def test_a_read_only_folder(verb: str, forks: Forks, inputs: Path, trained: Path
     assert forks.run(Request(arguments=arguments, log=str(log))).code == 0, log.read_text()
 
 
-@pytest.mark.parametrize(("target", "shares"), [(TRAIN, (0.35, 0.6, 0.95)), (BUILD, (0.2, 0.5, 0.8)), (SYNTH, (0.95,))])
+@pytest.mark.parametrize(("target", "shares"), [(TRAIN, (0.35, 0.6, 0.95)), (BUILD, (0.2, 0.5, 0.8))])
 def test_a_disk_that_fills_up_later_keeps_what_was_saved(
     target: Target, shares: tuple[float, ...], forks: Forks, inputs: Path, tmp_path: Path
 ) -> None:
