@@ -48,9 +48,17 @@ def require_writable(path: Path | str) -> None:
         raise StorageError(path, error.strerror) from error
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder and those above it, unless it is there; `InputError` when a file has its name."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as error:
+        raise InputError(f"{folder}: expected a folder, found a file; choose another place") from error
+
+
 def _new_partial(path: Path) -> Path:
     """An empty file with a temporary name beside `path`, whose folder is made when it is missing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=f".partial{path.suffix}", dir=path.parent)
     os.close(handle)
     return Path(name)

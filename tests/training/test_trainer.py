@@ -70,6 +70,14 @@ def test_a_run_resumed_after_its_end_is_done(store: PatchStore, tmp_path: Path) 
     assert before == {name: (tmp_path / name).read_bytes() for name in before}
 
 
+def test_a_run_resumed_beyond_its_new_end_has_a_model(store: PatchStore, tmp_path: Path) -> None:
+    """Stopped before its first checkpoint, then made shorter than what is done already."""
+    with pytest.raises(Interrupted):
+        train(TINY, store, tmp_path, device="cpu", should_stop=lambda: True)
+    summary = train(dataclasses.replace(TINY, steps=1), store, tmp_path, device="cpu", resume=True)
+    assert describe_model(tmp_path).provenance["step"] == summary.steps == 1
+
+
 def test_a_run_killed_before_its_first_checkpoint_starts_again(store: PatchStore, tmp_path: Path) -> None:
     """With or without --resume: there is a sign of it (the log, a lock nobody holds), and nothing to go on from."""
     train(TINY, store, tmp_path / "whole", device="cpu")

@@ -25,6 +25,7 @@ from carstudio.dataset.summary import BuildSummary, count_reasons
 from carstudio.dataset.verdicts import Verdict
 from carstudio.dataset.workers import ordered_map
 from carstudio.errors import InputError
+from carstudio.locks import clear_leftovers
 from carstudio.perception.results import Segmenter
 from carstudio.perception.specs import make_segmenter
 from carstudio.progress import Report, silent
@@ -86,6 +87,7 @@ def build(config: BuildConfig, report: Report = silent) -> BuildSummary:
     """Make the store `config.out`; verdicts and splits are written at the end."""
     start = time.perf_counter()
     if is_made_already(config.out, asdict(config)):
+        clear_leftovers(config.out)
         store = open_store(config.out)
         return summarize(store, source=config.source, verdicts=store.verdicts())
     source = open_source(config)

@@ -56,7 +56,7 @@ def ordered_map(
 @contextmanager
 def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     context = multiprocessing.get_context("spawn")  # torch and onnxruntime have threads: forking them is not safe
-    resource_tracker.ensure_running()  # its start unblocks signals, which must not happen while a worker starts
+    _start_tracker()
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin)
     try:
@@ -67,6 +67,23 @@ def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
             worker.kill()  # leaving the pool's own `with` block would wait for everything that was handed out
         pool.shutdown(wait=False, cancel_futures=True)
         raise
+
+
+def _start_tracker() -> None:
+    """Start what removes the semaphores of a process that ends without doing so itself, and tell it to keep quiet.
+
+    It starts here because its start unblocks signals, which must not happen while a worker starts.
+    """
+    before = os.environ.get("PYTHONWARNINGS")
+    quiet = "ignore::UserWarning:multiprocessing.resource_tracker"
+    os.environ["PYTHONWARNINGS"] = f"{before},{quiet}" if before else quiet
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        if before is None:
+            del os.environ["PYTHONWARNINGS"]
+        else:
+            os.environ["PYTHONWARNINGS"] = before
 
 
 def _submit(pool: ProcessPoolExecutor, work: Callable[[Item], Result], items: Sequence[Item]) -> Future[list[Result]]:

@@ -31,6 +31,7 @@ from carstudio.geometry.box3d import envelope
 from carstudio.geometry.overlap import box2d_iou
 from carstudio.geometry.transforms import quaternion_from_rotation
 from carstudio.images import encode_depth, encode_png
+from carstudio.locks import clear_leftovers
 from carstudio.progress import Report, silent
 from carstudio.synthetic.benchmark import BENCHMARK_CARS, BENCHMARK_SEED, BENCHMARK_SIZE_PX, BENCHMARK_VIEWS
 from carstudio.synthetic.cameras import CameraKind
@@ -89,6 +90,7 @@ def synthesize(config: SynthConfig, report: Report = silent) -> BuildSummary:
     start = time.perf_counter()
     _check(config)
     if is_made_already(config.out, asdict(config)):
+        clear_leftovers(config.out)
         store = open_store(config.out)
         return summarize(store, source=SOURCE, verdicts=store.verdicts())
     files = mesh_files(config.meshes)
