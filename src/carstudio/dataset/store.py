@@ -15,6 +15,7 @@ import pyarrow.parquet as pq
 
 from carstudio.dataset.manifest import Manifest, data_sha256, read_manifest
 from carstudio.dataset.patch import Patch, PatchRecord
+from carstudio.dataset.reading import reading
 from carstudio.dataset.schema import LIGHT_COLUMNS, PICTURES, SCHEMA, check_id, record_from_row
 from carstudio.dataset.verdicts import Verdict, table_from_verdicts, verdicts_from_table
 from carstudio.dataset.verify import verify_store
@@ -84,13 +85,15 @@ class PatchStore:
             raise InputError(f"{self.path}: no column {unknown}; there are {self._files[0].schema_arrow.names}")
         if not self._files:
             return SCHEMA.empty_table().select(columns)
-        return pa.concat_tables([file.read(columns=columns) for file in self._files])
+        with reading(self.path / "data"):
+            return pa.concat_tables([file.read(columns=columns) for file in self._files])
 
     @cached_property
     def _locations(self) -> dict[str, Location]:
         locations: dict[str, Location] = {}
         for shard, file in enumerate(self._files):
-            ids = file.read(columns=["patch_id"])["patch_id"].to_pylist()
+            with reading(shard_paths(self.path)[shard]):
+                ids = file.read(columns=["patch_id"])["patch_id"].to_pylist()
             start = 0
             for group in range(file.num_row_groups):
                 stop = start + file.metadata.row_group(group).num_rows
@@ -115,10 +118,14 @@ class PatchStore:
         return list(ids)
 
     def _read_pictures(self, shard: int, group: int) -> pa.Table:
-        return self._files[shard].read_row_group(group, columns=list(PICTURES), use_threads=False)
+        return self._read_group(shard, group, PICTURES)
 
     def _read_light(self, shard: int, group: int) -> pa.Table:
-        return self._files[shard].read_row_group(group, columns=list(LIGHT_COLUMNS), use_threads=False)
+        return self._read_group(shard, group, LIGHT_COLUMNS)
+
+    def _read_group(self, shard: int, group: int, columns: Iterable[str]) -> pa.Table:
+        with reading(shard_paths(self.path)[shard]):
+            return self._files[shard].read_row_group(group, columns=list(columns), use_threads=False)
 
     def record(self, patch_id: str) -> PatchRecord:
         """One patch as stored."""
@@ -220,14 +227,18 @@ _SPLIT_SCHEMA = pa.schema(
 
 
 def _open_shard(path: Path) -> pq.ParquetFile:
-    try:
-        return pq.ParquetFile(path, memory_map=True)
-    except (pa.ArrowException, OSError) as error:
-        raise InputError(f"{path}: expected a Parquet file, found something else ({error}); restore it") from error
+    with reading(path):
+        file = pq.ParquetFile(path, memory_map=True)
+        found = {field.name: field.type for field in file.schema_arrow}
+    for field in SCHEMA:
+        if found.get(field.name) != field.type:
+            raise InputError(
+                f"{path}: column {field.name!r} must be {field.type}, found {found.get(field.name, 'none')}; "
+                "it is no shard of a CarPatch3D store, or a damaged one"
+            )
+    return file
 
 
 def _read_side_table(path: Path) -> pa.Table:
-    try:
+    with reading(path):
         return pq.read_table(path)
-    except (pa.ArrowException, OSError) as error:
-        raise InputError(f"{path}: expected a Parquet file, found something else ({error}); restore it") from error
