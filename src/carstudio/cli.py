@@ -31,6 +31,7 @@ VERBS = {
     "dataset": ("carstudio.commands.dataset:Dataset", "CarPatch3D -> counts (info) or a check of every byte (verify)"),
     "train": ("carstudio.commands.train:Train", "recipe + CarPatch3D -> trained model"),
     "evaluate": ("carstudio.commands.evaluate:Evaluate", "trained model + protocol -> result rows and their table"),
+    "report": ("carstudio.commands.report:WriteReport", "trained model + store -> both protocols, pictures, one page"),
     "render": ("carstudio.commands.render:Render", "trained model + photos -> turntables, opacity, depth"),
 }
 

@@ -66,6 +66,28 @@ def test_evaluate_writes_rows_and_prints_json(trained: Path, capsys: pytest.Capt
     assert "lpips" in json.loads((trained / "rows.header.json").read_text())["reasons"]
 
 
+def test_report_scores_both_protocols_on_one_page(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = trained / "report"
+    command = ["report", str(trained / "run"), "--data", str(trained / "data"), "--out", str(out), "--split", "None"]
+    assert run([*command, "--turntables", "1", "--device", "cpu", "--json"]) == 0
+    protocols = {found["protocol"]: found["num_images"] for found in json.loads(capsys.readouterr().out)["summary"]}
+    assert protocols == {"novel-view": 9, "input-view": 9}
+    assert len((out / "novel-view.jsonl").read_text().splitlines()) == 9
+    page = (out / "index.html").read_text()
+    assert "From photo to car" in page
+    assert read_image(out / "checks.png").shape[0] > 9 * 100  # nine rows of pictures
+    assert len(list((out / "turntables").iterdir())) == 1
+
+
+def test_report_of_cars_seen_once_has_no_novel_views(trained: Path) -> None:
+    toy_store(trained / "once", cars=2, views=1)
+    out = trained / "report-once"
+    command = ["report", str(trained / "run"), "--data", str(trained / "once"), "--out", str(out), "--split", "None"]
+    assert run([*command, "--turntables", "1", "--device", "cpu", "--quiet"]) == 0
+    assert not (out / "novel-view.jsonl").exists()
+    assert "Novel views" not in (out / "index.html").read_text()
+
+
 def test_render_goes_round_the_car(trained: Path) -> None:
     out = trained / "views"
     command = ["render", str(trained / "run"), "--data", str(trained / "data"), "--patches", "toy-0-0"]
@@ -197,3 +219,12 @@ def test_a_reader_that_leaves_is_no_error(trained: Path) -> None:
 def test_dataset_info_and_verify(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["dataset", "info", str(trained / "data"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["patches"] == 9
+
+
+def test_the_learning_rate_keeps_its_fall_to_a_share_of_the_first(trained: Path) -> None:
+    out = trained / "gentle"
+    command = ["train", "car-nerf-small", "--data", str(trained / "data"), "--out", str(out), *TRAIN]
+    assert run([*command, "--learning-rate", "1e-4", "--init", str(trained / "run")]) == 0
+    schedule = json.loads((out / "model.json").read_text())["provenance"]["training"]["schedule"]
+    assert schedule["first"] == 1e-4
+    assert schedule["last"] == pytest.approx(1e-4 / 50)  # the recipe falls from 5e-3 to 1e-4

@@ -176,6 +176,8 @@ def test_broken_models_are_refused_with_a_reason(store: PatchStore, tmp_path: Pa
         ({"config": {**value["config"], "wings": 2}}, "unknown fields"),
         ({"config": {**value["config"], "width": "wide"}}, "'width'"),
         ({"config": {**value["config"], "width": 48}}, "shape"),
+        ({"config": {**value["config"], "width": 10**9}}, r"config\.width = 1000000000 must lie between"),
+        ({"config": {**value["config"], "depth": -1}}, r"config\.depth = -1 must lie between"),
     ):
         description.write_text(json.dumps({**value, **change}))
         with pytest.raises(InputError, match=message):

@@ -19,7 +19,7 @@ class Demo(Output):
     """Synthetic cars; every tenth is kept for testing."""
     views: int = 12
     """Photographs of each."""
-    minutes: float = 5.0
+    minutes: float = 6.0
     """Training time."""
     seed: int = 0
     """Start of all randomness."""

@@ -8,6 +8,7 @@ import tyro
 
 from carstudio.commands.command import Outcome, Output, plain, provenance
 from carstudio.dataset.store import PatchStore, open_store
+from carstudio.errors import InputError
 from carstudio.models.interface import CategoryModel
 from carstudio.recipes import recipe
 from carstudio.report.panels import views_panel
@@ -41,6 +42,9 @@ class Train(Output):
     """Go on with the run in --out."""
     split: str | None = "instance"
     """Split whose training part is used; "None" for all kept patches."""
+    learning_rate: float | None = None
+    """First learning rate; the last one keeps its ratio to it (the recipe's own when absent; a tenth of it or
+    less for a short run from --init, which would otherwise forget what it started from)."""
     supervision: Supervision | None = None
     """Which photo an encoded photo must explain (the recipe's own when absent)."""
     pictures: Annotated[int, tyro.conf.arg(metavar="N")] = 6
@@ -53,6 +57,12 @@ class Train(Output):
             config = replace(config, steps=self.steps)
         if self.supervision is not None:
             config = replace(config, supervision=self.supervision)
+        if self.learning_rate is not None:
+            if not self.learning_rate > 0:
+                raise InputError(f"--learning-rate must be positive, found {self.learning_rate}")
+            ratio = config.schedule.last / config.schedule.first
+            schedule = replace(config.schedule, first=self.learning_rate, last=ratio * self.learning_rate)
+            config = replace(config, schedule=schedule)
         return config
 
     def saved(self) -> str:

@@ -18,6 +18,7 @@ from carstudio.models.zoo import ModelConfig, build_model, config_from_json, con
 
 FORMAT_VERSION = 1
 WEIGHTS, DESCRIPTION = "model.safetensors", "model.json"
+MAX_SIZE = 16_384  # of any whole number in a model's description: sixty times the paper's widest layer
 
 
 @dataclass(frozen=True)
@@ -84,9 +85,28 @@ def load_model(path_or_name: Path | str, *, device: torch.device | str = "cpu") 
             f"{folder / WEIGHTS}: sha256 differs from the one in {DESCRIPTION}; the two do not belong together. "
             "Where a kill cut a checkpoint off, `carstudio train ... --resume` writes both again"
         )
+    _check_before_building(description.config, tensors, folder)
     model = build_model(description.config)
     load_weights(model, tensors, name=str(folder / WEIGHTS))
     return model.to(device).eval()
+
+
+def _check_before_building(config: ModelConfig, tensors: dict[str, torch.Tensor], folder: Path) -> None:
+    """Refuse a description whose sizes are absurd, or are not the weights', before memory is taken for them."""
+    too_large = _sizes_beyond(config_to_json(config), "config")
+    if too_large:
+        raise InputError(
+            f"{folder / DESCRIPTION}: {too_large[0]} must lie between 0 and {MAX_SIZE}; the file is damaged or foreign"
+        )
+    with torch.device("meta"):
+        expected = build_model(config).state_dict()
+    _check_names_and_shapes(expected, tensors, name=str(folder / WEIGHTS))
+
+
+def _sizes_beyond(value: Any, name: str) -> list[str]:
+    if isinstance(value, dict):
+        return [found for key, item in value.items() for found in _sizes_beyond(item, f"{name}.{key}")]
+    return [f"{name} = {value}"] if isinstance(value, int) and not 0 <= value <= MAX_SIZE else []
 
 
 def load_weights_of(folder: Path, model: CategoryModel, config: ModelConfig) -> str:
@@ -102,14 +122,17 @@ def load_weights_of(folder: Path, model: CategoryModel, config: ModelConfig) -> 
 
 def load_weights(model: torch.nn.Module, tensors: dict[str, torch.Tensor], *, name: str) -> None:
     """`load_state_dict` with an error a user can read: names what is missing, left over or of another shape."""
-    expected = model.state_dict()
+    _check_names_and_shapes(model.state_dict(), tensors, name=name)
+    model.load_state_dict(tensors)
+
+
+def _check_names_and_shapes(expected: dict[str, torch.Tensor], tensors: dict[str, torch.Tensor], *, name: str) -> None:
     missing, extra = sorted(expected.keys() - tensors.keys()), sorted(tensors.keys() - expected.keys())
     if missing or extra:
         raise InputError(f"{name}: weights of another model: missing {missing[:4]}, left over {extra[:4]}")
     for key, tensor in tensors.items():
         if tensor.shape != expected[key].shape:
             raise InputError(f"{name}: {key} has shape {list(tensor.shape)}, expected {list(expected[key].shape)}")
-    model.load_state_dict(tensors)
 
 
 def pick_device(name: str) -> torch.device:
