@@ -17,8 +17,11 @@ from carstudio.errors import InputError
 VERBS = {
     "demo": ("carstudio.commands.demo:Demo", "nothing -> the whole path on synthetic cars, with an HTML report"),
     "synth": ("carstudio.commands.synth:Synth", "nothing or meshes -> photographs of synthetic cars with exact truth"),
-    "build": ("carstudio.commands.build:Build", "KITTI-DET or KITTI-MOT -> CarPatch3D"),
-    "dataset": ("carstudio.commands.dataset:Dataset", "CarPatch3D -> counts (info) or a check of every byte (verify)"),
+    "build": ("carstudio.commands.build:Build", "KITTI-DET, KITTI-MOT or the authors' json -> CarPatch3D"),
+    "dataset": (
+        "carstudio.commands.dataset:Dataset",
+        "CarPatch3D -> counts, a check of every byte, new verdicts, the authors' format",
+    ),
     "train": ("carstudio.commands.train:Train", "recipe + CarPatch3D -> trained model"),
     "evaluate": ("carstudio.commands.evaluate:Evaluate", "trained model + protocol -> result rows and their table"),
     "render": ("carstudio.commands.render:Render", "trained model + photos -> turntables, opacity, depth"),

@@ -12,7 +12,6 @@ from carstudio.dataset.filters import FilterRecipe
 from carstudio.dataset.sources.frame import CameraOffset
 from carstudio.dataset.summary import BuildSummary
 
-
 _SHOWN_PROBLEMS = 20
 
 

@@ -13,8 +13,8 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
 from itertools import islice
+from pathlib import Path
 from typing import Any, Literal
 
 import cv2
@@ -148,7 +148,9 @@ def plan_legacy(config: BuildConfig, report: Report = silent) -> Plan:
     """The authors' records: nothing is segmented, everything is kept."""
     for name, default in (("frames", None), ("sequence", None), ("segmenter", "grabcut"), ("types", ("Car",))):
         if getattr(config, name) != default:
-            raise InputError(f"--{name} is for sources with photographs; legacy-json takes patches and masks as they are")
+            raise InputError(
+                f"--{name} is for sources with photographs; legacy-json takes patches and masks as they are"
+            )
     if config.filters != FilterRecipe():
         raise InputError(
             "legacy-json keeps all that the authors released, no thresholds apply; build without them, then judge the "

@@ -127,8 +127,14 @@ class PatchStore:
 
     def light_records(self) -> Iterator[PatchRecord]:
         """All candidates in store order without their pictures (`image` is empty): for filters."""
-        for batch in self.table().to_batches(max_chunksize=4096):
-            yield from map(record_from_row, batch.to_pylist())
+        for file in self._files:
+            yield from map(record_from_row, file.read(columns=list(LIGHT_COLUMNS)).to_pylist())
+
+    def records(self) -> Iterator[PatchRecord]:
+        """All candidates in store order, kept or not, with their pictures; one row group is in memory at a time."""
+        for file in self._files:
+            for group in range(file.num_row_groups):
+                yield from map(record_from_row, file.read_row_group(group, use_threads=False).to_pylist())
 
     def patch(self, patch_id: str) -> Patch:
         """One patch decoded."""

@@ -22,8 +22,8 @@ def verify_store(store: "PatchStore") -> list[str]:
     problems = list(_shard_problems(store))
     if problems:
         return problems
-    for patch_id in store.patch_ids(kept=False):
-        problems += [f"patch {patch_id}: {problem}" for problem in record_problems(store.record(patch_id))]
+    for record in store.records():
+        problems += [f"patch {record.patch_id}: {problem}" for problem in record_problems(record)]
     known = set(store.patch_ids(kept=False))
     for verdict in store.verdicts():
         if verdict.patch_id not in known:

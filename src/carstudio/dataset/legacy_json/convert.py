@@ -22,9 +22,9 @@ from carstudio.images import decode_image, encode_png, image_size
 from carstudio.perception.results import Window
 
 MAX_PICTURE_BYTES = 64 * 2**20  # of one patch or mask; the authors' have some 50 kB
-_UNBOUNDED_PX = 2**31 - 1  # a photograph of unknown size cuts no box off on the right and below
+UNBOUNDED_PX = 2**31 - 1  # a photograph of unknown size cuts no box off on the right and below
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
-_PNG_BIT_DEPTH = 24  # offset of this byte in a PNG file (ISO 15948, IHDR)
+_PNG_DEPTH_AND_COLOUR = slice(24, 26)  # these bytes of a PNG file (ISO 15948, IHDR)
 
 
 def patch_record(
@@ -90,7 +90,7 @@ def record_window(record: LegacyRecord) -> Window:
     """The crop in whole pixels: truncated to int, both ends included, clipped to the photograph where it is known."""
     if min(record.box2d[2:]) < 0:
         raise InputError(f"2-D box {record.box2d} lies left of or above the photograph")
-    return crop_window(record.box2d, *(record.frame_size or (_UNBOUNDED_PX, _UNBOUNDED_PX)))
+    return crop_window(record.box2d, *(record.frame_size or (UNBOUNDED_PX, UNBOUNDED_PX)))
 
 
 def record_offset(record: LegacyRecord) -> Vector3:
@@ -139,9 +139,18 @@ def _read_picture(folder: Path, name: str, window: Window) -> bytes:
 
 def decode_mask(data: bytes, *, name: str) -> UInt8[np.ndarray, "height width"]:
     """1 where any channel is not zero (visible car), 0 elsewhere."""
-    if data.startswith(_PNG_MAGIC) and data[_PNG_BIT_DEPTH] > 8:
-        raise InputError(f"{name}: expected a mask of 8 bits per channel, found {data[_PNG_BIT_DEPTH]}")
-    return decode_image(data, name=name).any(axis=-1).astype(np.uint8)
+    found = png_format(data)
+    if found is not None and found[0] > 8:
+        raise InputError(f"{name}: expected a mask of 8 bits per channel, found {found[0]}")
+    return np.any(decode_image(data, name=name), axis=-1).astype(np.uint8)
+
+
+def png_format(data: bytes) -> tuple[int, int] | None:
+    """(bits per channel, colour type: 0 grey, 2 RGB) of a PNG file; None for other files."""
+    if not data.startswith(_PNG_MAGIC) or len(data) < _PNG_DEPTH_AND_COLOUR.stop:
+        return None
+    depth, colour = data[_PNG_DEPTH_AND_COLOUR]
+    return depth, colour
 
 
 def _encode_mask(is_car: UInt8[np.ndarray, "height width"]) -> bytes:
@@ -150,5 +159,6 @@ def _encode_mask(is_car: UInt8[np.ndarray, "height width"]) -> bytes:
 
 def _is_store_mask(data: bytes, is_car: UInt8[np.ndarray, "height width"], name: str) -> bool:
     """Whether the authors' file is a mask of the store already: one channel, 0 and 255."""
-    is_grey = data.startswith(_PNG_MAGIC) and tuple(data[_PNG_BIT_DEPTH : _PNG_BIT_DEPTH + 2]) == (8, 0)
-    return is_grey and np.array_equal(decode_image(data, name=name, mode="L"), is_car * np.uint8(MaskValue.CAR))
+    return png_format(data) == (8, 0) and np.array_equal(
+        decode_image(data, name=name, mode="L"), is_car * np.uint8(MaskValue.CAR)
+    )

@@ -69,9 +69,7 @@ def _record(value: Mapping[str, Any]) -> LegacyRecord:
         raise InputError(f"2-D box must have xmin <= xmax and ymin <= ymax in px, found {(x0, y0, x1, y1)}")
     length, height, width = (_number(value, key) for key in ("length", "height", "width"))
     if min(length, height, width) < _LEAST:
-        raise InputError(
-            f"length, height, width must be at least {_LEAST}, in metres, found {(length, height, width)}"
-        )
+        raise InputError(f"length, height, width must be at least {_LEAST}, in metres, found {(length, height, width)}")
     tx, ty, tz = (_number(value, key) for key in ("cam_tx", "cam_ty", "cam_tz"))
     x, y, z = (_number(value, key) for key in ("obj_x", "obj_y", "obj_z"))
     return LegacyRecord(
@@ -104,7 +102,7 @@ def _path(value: Mapping[str, Any], key: str) -> str:
 
 
 def _is_text(text: str) -> bool:
-    """Half of a surrogate pair ("\\ud800") is JSON, but no file has such a name."""
+    """Half of a surrogate pair is JSON, but no file has such a name."""
     return "\0" not in text and not any("\ud800" <= character <= "\udfff" for character in text)
 
 

@@ -53,7 +53,7 @@ class LegacySource:
             for raw in read_instances(file.path):
                 identity = _unique(identify(subset, _patch_path(raw), raw.index), seen)
                 if identity.patch_id not in done:
-                    yield LegacyItem(file.path.name, file.dataset_name, identity, raw)
+                    yield LegacyItem(file.path.with_suffix(".json").name, file.dataset_name, identity, raw)
 
 
 def _patch_path(raw: RawInstance) -> str:
@@ -100,9 +100,8 @@ def open_legacy(root: Path, *, subset: str | None = None, report: Report = silen
     for done, path in enumerate(paths, start=1):
         file = scan_file(path)
         if file.dataset_name not in DATASET_NAMES:
-            raise InputError(
-                f"{path}: expected dataset_name to be one of {', '.join(DATASET_NAMES)}, found {file.dataset_name[:60]!r}"
-            )
+            names, found = ", ".join(DATASET_NAMES), file.dataset_name[:60]
+            raise InputError(f"{path}: expected dataset_name to be one of {names}, found {found!r}")
         files.append(file)
         report("read through", done, len(paths), path.name)
     source = LegacySource(paths[0].parent, tuple(files))
@@ -124,4 +123,6 @@ def _json_paths(root: Path, subset: str | None) -> list[Path]:
         if paths:
             return paths
     names = ", ".join(f"{name}.json" for name in wanted)
-    raise InputError(f"{root}: expected the authors' json, or a folder with {names} beside patch/ and mask/; found none")
+    raise InputError(
+        f"{root}: expected the authors' json, or a folder with {names} beside patch/ and mask/; found none"
+    )

@@ -63,9 +63,7 @@ class KittiDetSource:
         )
 
 
-def open_kitti_det(
-    root: Path, *, frames: str | None = None, camera_offset: CameraOffset = "exact"
-) -> KittiDetSource:
+def open_kitti_det(root: Path, *, frames: str | None = None, camera_offset: CameraOffset = "exact") -> KittiDetSource:
     """The frames with an image; `InputError` when there are none."""
     folder = find_layout(root, "image_2", "image_2, label_2, calib")
     refs = list_frames(folder / "image_2", frames)
