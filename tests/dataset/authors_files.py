@@ -89,7 +89,9 @@ def write_pictures(folder: Path, subset: str, records: list[dict[str, Any]]) -> 
             (record["mask"], mask),
         ):
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
-            Image.fromarray(pixels).save(folder / path, compress_level=number)  # bytes that no encoder of ours gives
+            Image.fromarray(pixels).save(
+                folder / path, compress_level=number % 10
+            )  # bytes that no encoder of ours gives
 
 
 def write_subset(folder: Path, subset: str, records: list[dict[str, Any]] | None = None) -> Path:

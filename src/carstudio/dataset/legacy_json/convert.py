@@ -126,8 +126,10 @@ def _read_picture(folder: Path, name: str, window: Window) -> bytes:
         if path.stat().st_size > MAX_PICTURE_BYTES:
             raise InputError(f"{name}: {path.stat().st_size} bytes, at most {MAX_PICTURE_BYTES} are read")
         data = path.read_bytes()
-    except (OSError, RuntimeError) as error:  # RuntimeError: links that go round in a circle
-        raise InputError(f"{name}: cannot be read ({error})") from error
+    except OSError as error:
+        raise InputError(f"{name}: cannot be read ({error.strerror})") from error
+    except RuntimeError as error:  # links that go round in a circle
+        raise InputError(f"{name}: cannot be read (a link that leads to itself)") from error
     size = image_size(data, name=name)
     if size != (window.width, window.height):
         raise InputError(

@@ -53,10 +53,10 @@ def parse_record(text: str) -> LegacyRecord:
         raise InputError(f"expected an object with the keys {', '.join(REQUIRED)}, found {_shown(value)}")
     missing = [key for key in REQUIRED if key not in value]
     if missing:
-        raise InputError(f"expected the keys {', '.join(missing)}, found none of them; only w and h may be left out")
+        raise InputError(f"the keys {', '.join(missing)} are missing; only w, h and the distortion may be left out")
     record = _record(value)
     if constants:
-        raise InputError(f"expected numbers as JSON knows them, found {constants[0]}")
+        raise InputError(f"expected numbers as JSON knows them, found {constants[0]} under a key that is not used")
     return record
 
 
@@ -97,7 +97,7 @@ def _number(value: Mapping[str, Any], key: str) -> float:
 def _path(value: Mapping[str, Any], key: str) -> str:
     found = value[key]
     if not isinstance(found, str) or not 0 < len(found) <= _MAX_PATH or not _is_text(found):
-        raise InputError(f"{key} must be a path of 1 to {_MAX_PATH} characters, found {_shown(found)}")
+        raise InputError(f"{key} must be a path of 1 to {_MAX_PATH} whole characters, found {_shown(found)}")
     return found
 
 
