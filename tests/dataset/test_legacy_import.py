@@ -10,6 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
+from carstudio.dataset import writer
 from carstudio.dataset.build import BuildConfig, build, judge_store
 from carstudio.dataset.filters import FilterRecipe
 from carstudio.dataset.legacy_json.names import identify
@@ -212,9 +213,10 @@ def test_root_may_be_a_file_its_folder_or_the_folder_above(authors: Path, tmp_pa
         assert {name[:2] for name in found.patch_ids()} == {"ko"}
 
 
-def test_workers_and_an_interruption_change_no_byte(tmp_path: Path) -> None:
+def test_workers_and_an_interruption_change_no_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(writer, "ROWS_PER_GROUP", 8)  # shards of 128
     value = make_record("km", "km_0000000000", 0)
-    records = [value | {"image_file": f"{index}.png"} for index in range(1400)]  # more than a shard, one patch file
+    records = [value | {"image_file": f"{index}.png"} for index in range(200)]  # of one patch file
     root = write_subset(tmp_path / "in", "km", records)
 
     def tree(path: Path) -> dict[str, bytes]:
@@ -222,7 +224,7 @@ def test_workers_and_an_interruption_change_no_byte(tmp_path: Path) -> None:
         return {str(file.relative_to(path)): file.read_bytes() for file in files}
 
     def interrupt(description: str, done: int, total: int, note: str = "") -> None:
-        if (description, done) == ("build", 1300):
+        if (description, done) == ("build", 180):
             raise KeyboardInterrupt
 
     whole = import_files(root, tmp_path / "whole")
@@ -231,7 +233,7 @@ def test_workers_and_an_interruption_change_no_byte(tmp_path: Path) -> None:
     config = BuildConfig(source="legacy-json", root=root, out=tmp_path / "again", workers=1)
     with pytest.raises(KeyboardInterrupt):
         build(config, interrupt)
-    assert len(open_store(tmp_path / "again")) == 1024
+    assert len(open_store(tmp_path / "again")) == 128
     build(replace(config, workers=2))
     assert tree(tmp_path / "again") == tree(tmp_path / "whole")
 
