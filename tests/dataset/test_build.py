@@ -147,8 +147,8 @@ def test_an_interrupted_build_goes_on_to_the_same_bytes(root: Path, tmp_path: Pa
 
 def test_refilter_looks_only_at_stored_values(root: Path, tmp_path: Path) -> None:
     store = build_small(root, tmp_path / "s")
-    strict = judge_store(store, FilterRecipe(depth_m=5.5, height_px=1.0, width_px=1.0, mask_ratio=0.0, box_iou=0.0))
-    assert [verdict.reason for verdict in strict] == ["depth_m", "depth_m", "kept"]
+    judge_store(store, FilterRecipe(depth_m=5.5, height_px=1.0, width_px=1.0, mask_ratio=0.0, box_iou=0.0))
+    assert [verdict.reason for verdict in store.verdicts()] == ["depth_m", "depth_m", "kept"]
     assert open_store(tmp_path / "s").patch_ids() == ["km-0000-000001-007"]
 
 

@@ -14,7 +14,6 @@ from carstudio.dataset.legacy_json.exporter import export_legacy
 from carstudio.dataset.runs import write_run
 from carstudio.dataset.splits import write_splits
 from carstudio.dataset.store import PatchStore, open_store
-from carstudio.dataset.summary import count_reasons
 from carstudio.errors import InputError
 
 
@@ -73,8 +72,9 @@ def refilter(store: PatchStore, recipe: FilterRecipe) -> Outcome:
     if not store.manifest.is_finished:
         raise InputError(f"{store.path}: the store is unfinished; run the command that wrote it again, then refilter")
     write_run(store.path, {"refilter": asdict(recipe)})
-    reasons = count_reasons(judge_store(store, recipe))
+    judge_store(store, recipe)
     splits = write_splits(open_store(store.path))
+    reasons = store.info()["reasons"]
     lines = [f"{store.path}: {reasons.get('kept', 0)} of {len(store)} patches kept"]
     lines += [f"  {count:6d}  {reason}" for reason, count in reasons.items()]
     lines += [f"  split {name}: {parts}" for name, parts in splits.items()]

@@ -29,8 +29,7 @@ from carstudio.dataset.sources.kitti_det import open_kitti_det
 from carstudio.dataset.sources.kitti_mot import open_kitti_mot
 from carstudio.dataset.splits import write_splits
 from carstudio.dataset.store import PatchStore, StoreWriter, open_store
-from carstudio.dataset.summary import BuildSummary, count_reasons
-from carstudio.dataset.verdicts import Verdict
+from carstudio.dataset.summary import BuildSummary
 from carstudio.errors import InputError
 from carstudio.perception.results import Segmenter
 from carstudio.perception.specs import make_segmenter
@@ -123,8 +122,8 @@ def build(config: BuildConfig, report: Report = silent) -> BuildSummary:
             problems += result.problems
             report("build", done, plan.num_items, f"{len(writer)} candidates")
     store = open_store(config.out)
-    verdicts = judge_store(store, plan.filters)
-    summary = summarize(store, source=plan.source, verdicts=verdicts)
+    judge_store(store, plan.filters)
+    summary = summarize(store, source=plan.source)
     return replace(summary, problems=tuple(problems), seconds=time.perf_counter() - start)
 
 
@@ -181,14 +180,12 @@ def open_source(config: BuildConfig) -> Source:
     )
 
 
-def judge_store(store: PatchStore, recipe: FilterRecipe) -> list[Verdict]:
+def judge_store(store: PatchStore, recipe: FilterRecipe) -> None:
     """Judge every patch again by its stored values and replace the store's verdicts."""
-    verdicts = [judge(record, recipe) for record in store.light_records()]
-    store.write_verdicts(verdicts)
-    return verdicts
+    store.write_verdicts(judge(record, recipe) for record in store.light_records())
 
 
-def summarize(store: PatchStore, *, source: str, verdicts: list[Verdict]) -> BuildSummary:
+def summarize(store: PatchStore, *, source: str) -> BuildSummary:
     """Write the splits over the kept patches and count everything."""
     splits = write_splits(store)
     info = store.info()
@@ -198,7 +195,7 @@ def summarize(store: PatchStore, *, source: str, verdicts: list[Verdict]) -> Bui
         candidates=len(store),
         kept=info["kept"],
         instances=info["kept_instances"],
-        reasons=count_reasons(verdicts),
+        reasons=info["reasons"],
         splits=splits,
     )
 

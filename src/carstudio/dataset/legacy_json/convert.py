@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
+from jaxtyping import Bool
 
 from carstudio.dataset.candidates import crop_window, envelope_iou
 from carstudio.dataset.legacy_json.fields import LegacyRecord, parse_record
@@ -36,8 +36,7 @@ def patch_record(
     image = _read_picture(folder, record.patch, window)
     decode_image(image, name=record.patch)  # a broken patch must not wait for the training to be found
     mask_file = _read_picture(folder, record.mask, window)
-    is_car = decode_mask(mask_file, name=record.mask)
-    mask = mask_file if _is_store_mask(mask_file, is_car, record.mask) else _encode_mask(is_car)
+    mask, is_car = store_mask(mask_file, name=record.mask)
     offset = record_offset(record) if camera_offset == "exact" else (0.0, 0.0, 0.0)
     box = record_box(record, offset)
     width, height = record.frame_size or (None, None)
@@ -139,12 +138,19 @@ def _read_picture(folder: Path, name: str, window: Window) -> bytes:
     return data
 
 
-def decode_mask(data: bytes, *, name: str) -> UInt8[np.ndarray, "height width"]:
-    """1 where any channel is not zero (visible car), 0 elsewhere."""
+def store_mask(data: bytes, *, name: str) -> tuple[bytes, Bool[np.ndarray, "height width"]]:
+    """The store's mask of one of the authors', and where it is car: any value that is not zero.
+
+    Their very bytes where they are such a mask already: one channel, 0 and 255.
+    """
     found = png_format(data)
     if found is not None and found[0] > 8:
         raise InputError(f"{name}: expected a mask of 8 bits per channel, found {found[0]}")
-    return np.any(decode_image(data, name=name), axis=-1).astype(np.uint8)
+    is_grey = found == (8, 0)
+    pixels = decode_image(data, name=name, mode="L" if is_grey else "RGB")
+    is_car = pixels != 0 if is_grey else np.any(pixels, axis=-1)
+    mask = np.where(is_car, MaskValue.CAR, MaskValue.BACKGROUND).astype(np.uint8)
+    return (data if is_grey and np.array_equal(pixels, mask) else encode_png(mask)), is_car
 
 
 def png_format(data: bytes) -> tuple[int, int] | None:
@@ -153,14 +159,3 @@ def png_format(data: bytes) -> tuple[int, int] | None:
         return None
     depth, colour = data[_PNG_DEPTH_AND_COLOUR]
     return depth, colour
-
-
-def _encode_mask(is_car: UInt8[np.ndarray, "height width"]) -> bytes:
-    return encode_png(np.where(is_car, MaskValue.CAR, MaskValue.BACKGROUND).astype(np.uint8))
-
-
-def _is_store_mask(data: bytes, is_car: UInt8[np.ndarray, "height width"], name: str) -> bool:
-    """Whether the authors' file is a mask of the store already: one channel, 0 and 255."""
-    return png_format(data) == (8, 0) and np.array_equal(
-        decode_image(data, name=name, mode="L"), is_car * np.uint8(MaskValue.CAR)
-    )

@@ -99,7 +99,8 @@ def synthesize(config: SynthConfig, report: Report = silent) -> BuildSummary:
                     writer.append(record)
             report("photograph", done, config.cars, f"{len(writer)} photos")
     store = open_store(config.out)
-    summary = summarize(store, source=SOURCE, verdicts=judge_store(store, KEEP_ALL))
+    judge_store(store, KEEP_ALL)
+    summary = summarize(store, source=SOURCE)
     return replace(summary, seconds=time.perf_counter() - start)
 
 
