@@ -27,25 +27,30 @@ from carstudio.rendering.volume import composite
 from carstudio.training.batches import generator_for
 from carstudio.training.checkpoint import pick_device
 from carstudio.training.losses import training_loss
+from carstudio.training.precision import Precision, autocast, resolve_precision
 
 
 class Subject:
     """A recipe with a fresh model, ready to train a step and to render a view."""
 
-    def __init__(self, name: str, device: torch.device, rays_per_patch: int, size_px: int) -> None:
+    def __init__(
+        self, name: str, device: torch.device, *, rays_per_patch: int, size_px: int, precision: Precision | None
+    ) -> None:
         self.name, self.device, self.config = name, device, recipe(name)
         torch.manual_seed(0)
         self.model = build_model(self.config.model).to(device)
         self.optimizer = torch.optim.RAdam(self.model.parameters(), lr=1e-4)
         batch = random_batch(self.config.patches_per_step, rays_per_patch, self.model.encoder_side_px)
         self.patches, self.pixels = (part.to(device) for part in batch)
+        self.precision = precision or self.config.precision
         self.rays, self.size_px = self.config.patches_per_step * rays_per_patch, size_px
 
     def train_step(self) -> None:
         """What the trainer does in one step, without logging."""
         self.model.train()
-        latents = self.model.encode(self.patches)
-        levels = self.model.trace_levels(self.pixels.rays, latents, self.pixels.box, generator_for(0, 0, "jitter"))
+        with autocast(self.precision, self.device):
+            latents = self.model.encode(self.patches)
+            levels = self.model.trace_levels(self.pixels.rays, latents, self.pixels.box, generator_for(0, 0, "jitter"))
         counts = self.pixels.is_known & to_canonical(self.pixels.rays, self.pixels.box).hit
         rendered = tuple(composite(level) for level in levels)
         terms = training_loss(rendered, self.pixels.rgb, self.pixels.alpha, counts, self.config.loss)
@@ -79,11 +84,13 @@ def main() -> None:
     parser.add_argument("--rays", type=int, default=128, help="rays per patch of a training step")
     parser.add_argument("--size", type=int, default=64, help="side of the rendered view, px")
     parser.add_argument("--device", default="auto")
+    parser.add_argument("--precision", choices=["auto", "float32", "bfloat16"], help="of training; the recipe's own")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     keep_freed_memory()
     device = pick_device(options.device)
-    subjects = [Subject(name, device, options.rays, options.size) for name in options.recipes]
+    sizes = {"rays_per_patch": options.rays, "size_px": options.size, "precision": options.precision}
+    subjects = [Subject(name, device, **sizes) for name in options.recipes]
     seconds: dict[tuple[str, str], list[tuple[float, float]]] = {}
     memory: dict[str, float] = {}
     for subject in subjects:  # warm-up, and the peak memory of one step
@@ -106,6 +113,7 @@ def row(
     pairs = zip(train, seconds[base.name, "train"], strict=True)
     return {
         "recipe": subject.name,
+        "precision": resolve_precision(subject.precision, subject.device),
         "train_rays_per_s": subject.rays / statistics.median(wall for wall, _ in train),
         "train_rays_per_cpu_s": subject.rays / statistics.median(cpu for _, cpu in train),
         "train_ratio": statistics.median((b[1] / base.rays) / (a[1] / subject.rays) for a, b in pairs),
@@ -122,14 +130,14 @@ def table(rows: list[dict[str, float | str]], device: torch.device, options: arg
         f"medians of {options.rounds} interleaved rounds; {options.rays} rays per patch and training step; ratio per "
         f"processor second; render: one {options.size} x {options.size} view, rays that miss the box included.",
         "",
-        "| recipe | train rays/s | train rays/CPU-s | ratio | render rays/s | render rays/CPU-s | step memory (MiB) |",
-        "|---|---:|---:|---:|---:|---:|---:|",
+        "| recipe | precision | train rays/s | per CPU-s | ratio | render rays/s | per CPU-s | step memory (MiB) |",
+        "|---|---|---:|---:|---:|---:|---:|---:|",
     ]
     for found in rows:
         figures = [f"{found[key]:,.0f}" for key in ("train_rays_per_s", "train_rays_per_cpu_s")]
         figures += [f"{found['train_ratio']:.1f}"]
         figures += [f"{found[key]:,.0f}" for key in ("render_rays_per_s", "render_rays_per_cpu_s", "step_memory_mib")]
-        lines.append(f"| {found['recipe']} | " + " | ".join(figures) + " |")
+        lines.append(f"| {found['recipe']} | {found['precision']} | " + " | ".join(figures) + " |")
     return "\n".join(lines)
 
 

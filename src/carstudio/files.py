@@ -3,13 +3,16 @@
 import hashlib
 import json
 import os
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from carstudio.errors import InputError
+from carstudio.errors import InputError, StorageError
+
+_PARTIAL = re.compile(r"\..*-[a-z0-9_]{8}\.partial(\.[^.]+)?")  # the temporary names of `atomic_path`
 
 
 @contextmanager
@@ -17,20 +20,60 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     """A temporary name beside `path` that takes its place when the block ends well and vanishes when it does not.
 
     The data reach the disk before the name does (fsync), so that a kill or a power cut leaves the old file or the new.
+    `StorageError` names `path` when the system refuses to write (disk full, folder read-only).
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=f".partial{path.suffix}", dir=path.parent)
-    os.close(handle)
-    partial = Path(name)
+    partial: Path | None = None
     try:
+        partial = _new_partial(path)
         yield partial
         with partial.open("rb+") as file:
             os.fsync(file.fileno())
         partial.chmod(0o666 & ~_umask())
         partial.replace(path)
+    except OSError as error:
+        if isinstance(error.filename, str) and Path(error.filename).parent not in path.parents:
+            raise  # about another file, which the block was reading
+        raise StorageError(path, os.strerror(error.errno) if error.errno else error) from error
     finally:
-        partial.unlink(missing_ok=True)
+        if partial is not None:
+            partial.unlink(missing_ok=True)
+
+
+def require_writable(path: Path | str) -> None:
+    """`StorageError` now rather than after an hour's work when a file could not be made at `path`."""
+    try:
+        _new_partial(Path(path)).unlink()
+    except OSError as error:
+        raise StorageError(path, error.strerror) from error
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder and those above it, unless it is there; `InputError` when a file has its name."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as error:
+        raise InputError(f"{folder}: expected a folder, found a file; choose another place") from error
+
+
+def _new_partial(path: Path) -> Path:
+    """An empty file with a temporary name beside `path`, whose folder is made when it is missing."""
+    make_folder(path.parent)
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=f".partial{path.suffix}", dir=path.parent)
+    os.close(handle)
+    return Path(name)
+
+
+def remove_partials(folder: Path | str) -> None:
+    """Delete what a killed process left of unfinished files in `folder` and below; its lock must be held."""
+    for path in Path(folder).rglob(".*.partial*"):
+        if is_partial(path) and path.is_file():
+            path.unlink(missing_ok=True)
+
+
+def is_partial(path: Path) -> bool:
+    """Whether a name is a temporary one of `atomic_path`."""
+    return _PARTIAL.fullmatch(path.name) is not None
 
 
 def _umask() -> int:

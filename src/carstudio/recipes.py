@@ -32,7 +32,7 @@ def car_nerf_small() -> TrainConfig:
     """Car-NeRF for a laptop's CPU: 4 x 128, small encoder, normalised codes, 8 x 8 colour skip, clipped gradients."""
     model = CarNeRFConfig(
         encoder=EncoderConfig(kind="small", side_px=64, pretrained=None, num_features=256, sees_mask=True),
-        sampling=SamplingConfig(coarse=32, fine=0),
+        sampling=SamplingConfig(coarse=20, fine=0),
         width=128,
         depth=4,
         skip_after=None,
@@ -46,10 +46,11 @@ def car_nerf_small() -> TrainConfig:
         recipe="car-nerf-small",
         model=model,
         loss=LossConfig(colour="whole-crop"),
-        schedule=ScheduleConfig(first=2e-3, last=1e-4, decay_steps=None, warmup_steps=100),
+        schedule=ScheduleConfig(first=5e-3, last=1e-4, decay_steps=None, warmup_steps=100),
         supervision="mixed",
-        patches_per_step=16,
-        rays_per_patch=128,
+        patches_per_step=32,
+        rays_per_patch=64,
+        precision="auto",
         steps=4_000,
         clip_gradient=1.0,
     )

@@ -1,11 +1,20 @@
 """The command line as a user meets it: whole runs on a toy store, exit codes, messages."""
 
+import errno
 import json
+import math
+import os
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 
+import carstudio.training.trainer
 from carstudio.cli import VERBS, run
+from carstudio.errors import Interrupted, StorageError
 from carstudio.images import read_image
 from training.toy import toy_store
 
@@ -57,6 +66,28 @@ def test_evaluate_writes_rows_and_prints_json(trained: Path, capsys: pytest.Capt
     assert "lpips" in json.loads((trained / "rows.header.json").read_text())["reasons"]
 
 
+def test_report_scores_both_protocols_on_one_page(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = trained / "report"
+    command = ["report", str(trained / "run"), "--data", str(trained / "data"), "--out", str(out), "--split", "None"]
+    assert run([*command, "--turntables", "1", "--device", "cpu", "--json"]) == 0
+    protocols = {found["protocol"]: found["num_images"] for found in json.loads(capsys.readouterr().out)["summary"]}
+    assert protocols == {"novel-view": 9, "input-view": 9}
+    assert len((out / "novel-view.jsonl").read_text().splitlines()) == 9
+    page = (out / "index.html").read_text()
+    assert "From photo to car" in page
+    assert read_image(out / "checks.png").shape[0] > 9 * 100  # nine rows of pictures
+    assert len(list((out / "turntables").iterdir())) == 1
+
+
+def test_report_of_cars_seen_once_has_no_novel_views(trained: Path) -> None:
+    toy_store(trained / "once", cars=2, views=1)
+    out = trained / "report-once"
+    command = ["report", str(trained / "run"), "--data", str(trained / "once"), "--out", str(out), "--split", "None"]
+    assert run([*command, "--turntables", "1", "--device", "cpu", "--quiet"]) == 0
+    assert not (out / "novel-view.jsonl").exists()
+    assert "Novel views" not in (out / "index.html").read_text()
+
+
 def test_render_goes_round_the_car(trained: Path) -> None:
     out = trained / "views"
     command = ["render", str(trained / "run"), "--data", str(trained / "data"), "--patches", "toy-0-0"]
@@ -97,6 +128,103 @@ def test_the_users_errors_are_one_message_and_exit_code_2(
     assert "Traceback" not in shown
 
 
+def ends_with(error: BaseException, monkeypatch: pytest.MonkeyPatch, trained: Path) -> int:
+    """Exit code of a verb whose work raises `error`."""
+
+    def fail(path: Path) -> None:
+        raise error
+
+    monkeypatch.setattr("carstudio.commands.dataset.open_store", fail)
+    return run(["dataset", "info", str(trained / "data")])
+
+
+def test_our_own_faults_keep_their_traceback_and_ask_for_a_report(
+    trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert ends_with(KeyError("colour"), monkeypatch, trained) == 1
+    shown = capsys.readouterr().err
+    assert "in fail" in shown
+    assert "KeyError: 'colour'" in shown
+    assert "a fault of carstudio" in shown
+    assert f"carstudio dataset info {trained / 'data'}" in shown
+
+
+def test_numbers_that_ran_away_are_told_without_a_traceback(
+    trained: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("carstudio.training.trainer.masked_psnr", lambda *arguments: 1.0)
+    real = carstudio.training.trainer.training_loss
+
+    def poisoned(*arguments: Any) -> dict[str, torch.Tensor]:
+        return {name: term * math.nan for name, term in real(*arguments).items()}
+
+    monkeypatch.setattr("carstudio.training.trainer.training_loss", poisoned)
+    command = ["train", "car-nerf-small", "--data", str(trained / "data"), "--out", str(trained / "nan"), *TRAIN]
+    assert run(command) == 1
+    shown = capsys.readouterr().err
+    assert shown.startswith("error: step 0: loss term ")
+    assert "is nan for cars ['toy-" in shown
+    assert "resume with another --seed" in shown
+    assert "Traceback" not in shown
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (OSError(errno.EIO, "Input/output error", "/mnt/disk/manifest.json"), "'/mnt/disk/manifest.json'"),
+        (StorageError("rows.jsonl", "No space left on device"), "rows.jsonl: cannot be written (No space left"),
+    ],
+)
+def test_what_the_system_refuses_is_one_message(
+    error: Exception,
+    message: str,
+    trained: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert ends_with(error, monkeypatch, trained) == 2
+    first, saved, again = capsys.readouterr().err.splitlines()
+    assert message in first
+    assert saved == "nothing was written"
+    assert again == f"go on with: carstudio dataset info {trained / 'data'}"
+
+
+@pytest.mark.parametrize(("error", "code"), [(KeyboardInterrupt(), 130), (Interrupted(15), 143)])
+def test_an_interruption_has_its_own_exit_code(
+    error: BaseException,
+    code: int,
+    trained: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert ends_with(error, monkeypatch, trained) == code
+    assert capsys.readouterr().err.startswith("interrupted; nothing was written\ngo on with: carstudio dataset info ")
+
+
+def test_a_reader_that_leaves_is_no_error(trained: Path) -> None:
+    program = "from carstudio.cli import main; main()"
+    reader, writer = os.pipe()
+    os.close(reader)
+    ended = subprocess.run(
+        [sys.executable, "-c", program, "dataset", "info", str(trained / "data")],
+        stdout=writer,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    os.close(writer)
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
 def test_dataset_info_and_verify(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["dataset", "info", str(trained / "data"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["patches"] == 9
+
+
+def test_the_learning_rate_keeps_its_fall_to_a_share_of_the_first(trained: Path) -> None:
+    out = trained / "gentle"
+    command = ["train", "car-nerf-small", "--data", str(trained / "data"), "--out", str(out), *TRAIN]
+    assert run([*command, "--learning-rate", "1e-4", "--init", str(trained / "run")]) == 0
+    schedule = json.loads((out / "model.json").read_text())["provenance"]["training"]["schedule"]
+    assert schedule["first"] == 1e-4
+    assert schedule["last"] == pytest.approx(1e-4 / 50)  # the recipe falls from 5e-3 to 1e-4

@@ -17,48 +17,17 @@ from carstudio.dataset.patch import MaskValue
 from carstudio.dataset.sources.frame import parse_frame_range
 from carstudio.dataset.store import PatchStore, open_store
 from carstudio.errors import InputError
-from carstudio.geometry.box3d import Box3D, envelope
+from carstudio.geometry.box3d import envelope
 from carstudio.geometry.camera import Camera
 from carstudio.geometry.overlap import box2d_iou
-from carstudio.geometry.transforms import rotation_y
-from carstudio.images import encode_png, read_image
-
-P2 = "P2 200 0 120 9 0 200 60 0.05 0 0 1 0.001"
-WIDTH, HEIGHT = 240, 120
-
-
-def car_line(x: float, z: float, kind: str = "Car") -> str:
-    """A label whose 2-D box is its 3-D box's envelope, to the hundredth of a pixel as KITTI writes it."""
-    camera = Camera(torch.tensor([200.0, 200.0, 120.0, 60.0]), WIDTH, HEIGHT)
-    center = torch.tensor([x + (9 - 0.12) / 200, 1.0 - 0.75 + (0.05 - 0.06) / 200, z + 0.001])
-    box = Box3D(center, torch.tensor([4.0, 1.5, 1.8]), rotation_y(torch.tensor(-1.2)))
-    outline = envelope(box, camera)
-    assert outline is not None
-    words = " ".join(f"{value:.2f}" for value in outline.tolist())
-    return f"{kind} 0 0 -1.2 {words} 1.5 1.8 4.0 {x} 1.0 {z} -1.2"
+from carstudio.images import read_image
+from dataset.made_up_kitti import HEIGHT, WIDTH, made_up_kitti
 
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     """Three frames of sequence 0000: two cars (one hides the other), a van, DontCare; frame 2 is broken."""
-    root = tmp_path / "kitti"
-    for folder in ("image_02/0000", "label_02", "calib"):
-        (root / "training" / folder).mkdir(parents=True)
-    rng = np.random.default_rng(0)
-    for frame in range(3):
-        pixels = rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
-        (root / "training" / "image_02" / "0000" / f"{frame:06d}.png").write_bytes(encode_png(pixels))
-    lines = [
-        f"0 7 {car_line(0.0, 6.0)}",
-        f"0 8 {car_line(0.8, 9.0)}",
-        f"0 9 {car_line(-3.0, 12.0, 'Van')}",
-        "0 -1 DontCare -1 -1 -10 1 2 30 40 -1 -1 -1 -1000 -1000 -1000 -10",
-        f"1 7 {car_line(0.1, 5.0)}",
-        f"2 7 {car_line(0.1, 5.0)} 0.9 extra",
-    ]
-    (root / "training" / "label_02" / "0000.txt").write_text("\n".join(lines) + "\n")
-    (root / "training" / "calib" / "0000.txt").write_text(P2 + "\n")
-    return root
+    return made_up_kitti(tmp_path / "kitti")
 
 
 def build_small(root: Path, out: Path, **changes: object) -> PatchStore:
@@ -139,6 +108,39 @@ def test_an_interrupted_build_goes_on_to_the_same_bytes(root: Path, tmp_path: Pa
     config = BuildConfig(source="kitti-mot", root=root, out=tmp_path / "s", workers=1)
     with pytest.raises(KeyboardInterrupt):
         build(config, interrupt)
+    assert not open_store(tmp_path / "s").manifest.is_finished
+    build(config)
+    build_small(root, tmp_path / "whole")
+    assert tree(tmp_path / "s") == tree(tmp_path / "whole")
+
+
+def test_a_finished_build_started_again_is_done_and_with_other_settings_refused(root: Path, tmp_path: Path) -> None:
+    """A job killed between its last write and its end is started again by its batch system."""
+    config = BuildConfig(source="kitti-mot", root=root, out=tmp_path / "s", workers=1)
+    first = build(config)
+    before = {path: path.read_bytes() for path in (tmp_path / "s").rglob("*") if path.is_file()}
+    (tmp_path / "s" / ".lock").touch()
+    again = build(replace(config, workers=2))
+    assert replace(again, seconds=0.0) == replace(first, problems=(), seconds=0.0)
+    assert before == {path: path.read_bytes() for path in (tmp_path / "s").rglob("*") if path.is_file()}
+    for changes in ({"filters": FilterRecipe(depth_m=5.0)}, {"frames": "0-1"}):
+        with pytest.raises(InputError, match="already holds a finished store"):
+            build(replace(config, **changes))  # type: ignore[arg-type]
+    shutil.rmtree(tmp_path / "s" / "runs")
+    with pytest.raises(InputError, match="already holds a finished store"):
+        build(config)
+
+
+@pytest.mark.parametrize("step", ["judge_store", "write_splits"])
+def test_finished_is_said_last(root: Path, tmp_path: Path, step: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def die(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    config = BuildConfig(source="kitti-mot", root=root, out=tmp_path / "s", workers=1)
+    with monkeypatch.context() as patched:
+        patched.setattr(f"carstudio.dataset.build.{step}", die)
+        with pytest.raises(KeyboardInterrupt):
+            build(config)
     assert not open_store(tmp_path / "s").manifest.is_finished
     build(config)
     build_small(root, tmp_path / "whole")

@@ -15,10 +15,40 @@ from carstudio.dataset.store import PatchStore, StoreWriter, open_store
 from carstudio.geometry.orbit import orbit_box, orbit_camera
 from carstudio.geometry.transforms import quaternion_from_rotation
 from carstudio.images import encode_png
+from carstudio.models.car_nerf import CarNeRFConfig
+from carstudio.models.encoders import EncoderConfig
+from carstudio.rendering.field import SamplingConfig
 from carstudio.rendering.rays import image_rays
+from carstudio.training.losses import LossConfig
+from carstudio.training.schedule import ScheduleConfig
+from carstudio.training.trainer import TrainConfig
 
 COLOURS = [((220, 40, 40), (40, 40, 220)), ((230, 200, 40), (40, 180, 60)), ((240, 240, 240), (60, 60, 60))]
 SIDE_PX = 40
+TINY = TrainConfig(
+    recipe="tiny",
+    model=CarNeRFConfig(
+        encoder=EncoderConfig(kind="small", side_px=32, pretrained=None, num_features=32, sees_mask=True),
+        sampling=SamplingConfig(coarse=16, fine=0),
+        width=32,
+        depth=3,
+        skip_after=None,
+        code_size=16,
+        position_frequencies=4,
+        direction_frequencies=1,
+        normalise_codes=True,
+        colour_skip_px=4,
+    ),
+    loss=LossConfig(colour="whole-crop"),
+    schedule=ScheduleConfig(first=1e-2, last=1e-3, decay_steps=None),
+    supervision="mixed",
+    patches_per_step=6,
+    rays_per_patch=64,
+    steps=12,
+    split=None,
+    log_every=2,
+    save_every=4,
+)
 
 
 def toy_record(car: int, view: int, azimuth_deg: float) -> PatchRecord:

@@ -11,6 +11,7 @@ from carstudio.dataset.build import BuildConfig, build
 from carstudio.dataset.filters import FilterRecipe
 from carstudio.dataset.sources.frame import CameraOffset
 from carstudio.dataset.summary import BuildSummary
+from carstudio.dataset.writer import count_patches, shard_paths
 
 _SHOWN_PROBLEMS = 20
 
@@ -40,6 +41,10 @@ class Build(Output):
     workers: int = 0
     """Processes; 0: one per core. Changes nothing in the result."""
 
+    def saved(self) -> str:
+        """The whole shards."""
+        return describe_unfinished(self.out)
+
     def run(self) -> Outcome:
         """Build and say what was kept and why the rest was not."""
         config = BuildConfig(
@@ -57,6 +62,11 @@ class Build(Output):
         with self.progress() as report:
             summary = build(config, report)
         return Outcome(describe(summary), plain(summary))
+
+
+def describe_unfinished(out: Path) -> str:
+    """What a stopped `build` or `synth` leaves."""
+    return f"{sum(count_patches(path) for path in shard_paths(out))} patches in whole shards are saved in {out}"
 
 
 def describe(summary: BuildSummary) -> str:

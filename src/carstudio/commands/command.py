@@ -34,6 +34,14 @@ class Output:
         """Do the work of the verb."""
         raise NotImplementedError
 
+    def saved(self) -> str:
+        """What is on disk when the verb was stopped in the middle, in a few words. Imports nothing: it is urgent."""
+        return "nothing was written"
+
+    def again(self, arguments: list[str]) -> list[str]:
+        """The command line that goes on where `arguments` were stopped, verb included."""
+        return arguments
+
     @contextmanager
     def progress(self) -> Iterator[Report]:
         """Bars on a terminal, silence with --quiet, --json or when the output is no terminal."""

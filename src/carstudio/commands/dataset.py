@@ -35,6 +35,10 @@ class Dataset(Output):
     filters: tyro.conf.OmitArgPrefixes[FilterRecipe] = field(default_factory=FilterRecipe)
     """refilter: thresholds; the released ones by default."""
 
+    def saved(self) -> str:
+        """The pictures that an export has written."""
+        return "nothing was written" if self.out is None else f"the pictures so far are saved in {self.out}"
+
     def run(self) -> Outcome:
         """Do what `action` says."""
         if self.action != "export" and (self.out is not None or self.patches != "kept"):

@@ -19,12 +19,16 @@ class Demo(Output):
     """Synthetic cars; every tenth is kept for testing."""
     views: int = 12
     """Photographs of each."""
-    minutes: float = 5.0
+    minutes: float = 6.0
     """Training time."""
     seed: int = 0
     """Start of all randomness."""
     device: str = "auto"
     """auto, cpu, cuda, mps, ..."""
+
+    def saved(self) -> str:
+        """The steps, and the training's last checkpoint."""
+        return f"what is finished in {self.out} is kept and not done again"
 
     def run(self) -> Outcome:
         """Run the path; what an earlier call finished is not done again."""

@@ -9,11 +9,11 @@ import tyro
 from carstudio.commands.command import Outcome, Output, plain, provenance
 from carstudio.dataset.store import open_store
 from carstudio.errors import InputError
-from carstudio.evaluation.perceptual import load_lpips
-from carstudio.evaluation.protocols import EvaluationConfig, Protocol, result_row, score_views, view_pairs
-from carstudio.evaluation.results import ResultHeader, write_rows
+from carstudio.evaluation.protocols import EvaluationConfig, Protocol
+from carstudio.evaluation.scored_run import score_run
 from carstudio.evaluation.summary import summarise
 from carstudio.evaluation.tables import result_tables, to_markdown
+from carstudio.files import require_writable
 from carstudio.training.checkpoint import describe_model, load_model, pick_device
 
 
@@ -38,32 +38,23 @@ class Evaluate(Output):
     device: str = "auto"
     """auto, cpu, cuda, mps, ..."""
 
+    def saved(self) -> str:
+        """Rows are written together when all images are scored."""
+        return "no row was written: they are written together at the end"
+
     def run(self) -> Outcome:
         """Score, write rows and header, and print the table."""
-        model = load_model(self.model, device=pick_device(self.device))
-        description = describe_model(self.model)
-        store = open_store(self.data)
+        model, description = load_model(self.model, device=pick_device(self.device)), describe_model(self.model)
         config = EvaluationConfig(protocol=self.protocol, limit=self.limit, seed=self.seed, **parse_split(self.split))
-        pairs = view_pairs(store, config)
-        lpips, reason = load_lpips()
+        require_writable(self.out)
         with self.progress() as report:
-            rows = [
-                result_row(
-                    view,
-                    config,
-                    method=str(description.provenance.get("recipe", self.model.name)),
-                    steps=int(description.provenance.get("step", 0)),
-                    data_sha256=store.data_sha256,
-                    checkpoint_sha256=description.sha256,
-                )
-                for view in score_views(model, store, pairs, lpips=lpips, report=report)
-            ]
-        reasons = {} if lpips is not None else {"lpips": str(reason)}
-        header = ResultHeader(command=provenance()["command"], reasons=reasons)
-        write_rows(self.out, rows, header)
-        summaries = summarise(rows)
+            scored = score_run(
+                model, description, open_store(self.data), config, command=provenance()["command"], report=report
+            )
+        scored.write(self.out)
+        summaries = summarise(scored.rows)
         tables = "\n".join(to_markdown(table) for table in result_tables(summaries, intervals=True))
-        return Outcome(tables, {"rows": len(rows), "summary": plain(summaries)})
+        return Outcome(tables, {"rows": len(scored.rows), "summary": plain(summaries)})
 
 
 def parse_split(text: str) -> dict[str, Any]:

@@ -40,6 +40,10 @@ class Render(Output):
     device: str = "auto"
     """auto, cpu, cuda, mps, ..."""
 
+    def saved(self) -> str:
+        """Pictures, each of them whole."""
+        return f"the pictures finished so far are whole in {self.out}"
+
     def run(self) -> Outcome:
         """Render and write."""
         if self.views < 1 or not 8 <= self.size <= 4096:

@@ -8,10 +8,13 @@ import tyro
 
 from carstudio.commands.command import Outcome, Output, plain, provenance
 from carstudio.dataset.store import PatchStore, open_store
+from carstudio.errors import InputError
 from carstudio.models.interface import CategoryModel
 from carstudio.recipes import recipe
 from carstudio.report.panels import views_panel
+from carstudio.signals import held_back_stops
 from carstudio.training.batches import Supervision
+from carstudio.training.resume import has_state, saved_step
 from carstudio.training.trainer import TrainConfig, train
 
 
@@ -33,10 +36,15 @@ class Train(Output):
     """auto, cpu, cuda, cuda:1, mps, ..."""
     seed: int = 0
     """Start of all randomness."""
+    init: Path | None = None
+    """Run whose weights to start from (same recipe), such as one trained on many synthetic cars."""
     resume: bool = False
     """Go on with the run in --out."""
     split: str | None = "instance"
     """Split whose training part is used; "None" for all kept patches."""
+    learning_rate: float | None = None
+    """First learning rate; the last one keeps its ratio to it (the recipe's own when absent; a tenth of it or
+    less for a short run from --init, which would otherwise forget what it started from)."""
     supervision: Supervision | None = None
     """Which photo an encoded photo must explain (the recipe's own when absent)."""
     pictures: Annotated[int, tyro.conf.arg(metavar="N")] = 6
@@ -49,7 +57,22 @@ class Train(Output):
             config = replace(config, steps=self.steps)
         if self.supervision is not None:
             config = replace(config, supervision=self.supervision)
+        if self.learning_rate is not None:
+            if not self.learning_rate > 0:
+                raise InputError(f"--learning-rate must be positive, found {self.learning_rate}")
+            ratio = config.schedule.last / config.schedule.first
+            schedule = replace(config.schedule, first=self.learning_rate, last=ratio * self.learning_rate)
+            config = replace(config, schedule=schedule)
         return config
+
+    def saved(self) -> str:
+        """The step to go on from."""
+        return describe_checkpoint(self.out)
+
+    def again(self, arguments: list[str]) -> list[str]:
+        """With --resume, once there is a checkpoint."""
+        is_asked = "--resume" in arguments or not has_state(self.out)
+        return arguments if is_asked else [*arguments, "--resume"]
 
     def run(self) -> Outcome:
         """Train; pictures of unseen cars go to OUT/pictures."""
@@ -59,23 +82,31 @@ class Train(Output):
             if self.pictures:
                 views_panel(model, store, self.out / "pictures" / f"step-{step:07d}.png", self.split, self.pictures)
 
-        with self.progress() as report:
+        with self.progress() as report, held_back_stops() as stops:
             summary = train(
                 self.config(),
                 store,
                 self.out,
                 device=self.device,
                 resume=self.resume,
+                init=self.init,
                 provenance={**provenance(), **store_origin(store)},
                 report=report,
                 on_save=draw,
+                should_stop=lambda: bool(stops),
             )
         text = (
             f"{self.recipe}: {summary.steps} steps in {summary.seconds:.0f} s ({summary.rays_per_s:,.0f} rays/s), "
-            f"encoder from {summary.encoder_start}; PSNR on the last batch's car pixels {summary.psnr:.2f} dB\n"
+            f"{summary.precision}, {summary.starts_from}; PSNR on the last batch's car pixels {summary.psnr:.2f} dB\n"
             f"model in {self.out}"
         )
         return Outcome(text, plain(summary))
+
+
+def describe_checkpoint(run: Path) -> str:
+    """What a stopped training leaves."""
+    step = saved_step(run) if has_state(run) else None
+    return f"no checkpoint is there yet in {run}" if step is None else f"step {step} is saved in {run}"
 
 
 def store_origin(store: PatchStore) -> dict[str, str]:

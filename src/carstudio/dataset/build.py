@@ -6,31 +6,27 @@ build goes on where it stopped when it is started again with the same settings.
 
 import hashlib
 import json
-import multiprocessing
 import os
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Callable, Iterable
+from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
-from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
-
-import cv2
-import torch
 
 from carstudio.dataset.candidates import FrameResult, records_of_frame
 from carstudio.dataset.filters import FilterRecipe, judge
 from carstudio.dataset.legacy_json.importer import KEEP_RELEASED, SOURCE, LegacyJob, open_legacy
-from carstudio.dataset.runs import write_run
+from carstudio.dataset.runs import is_made_already, write_run
 from carstudio.dataset.sources.frame import CameraOffset, FrameRef, Source
 from carstudio.dataset.sources.kitti_det import open_kitti_det
 from carstudio.dataset.sources.kitti_mot import open_kitti_mot
 from carstudio.dataset.splits import write_splits
-from carstudio.dataset.store import PatchStore, StoreWriter, open_store
+from carstudio.dataset.store import PARTS, PatchStore, StoreWriter, open_store
 from carstudio.dataset.summary import BuildSummary
+from carstudio.dataset.workers import ordered_map
 from carstudio.errors import InputError
+from carstudio.locks import clear_leftovers
 from carstudio.perception.results import Segmenter
 from carstudio.perception.specs import make_segmenter
 from carstudio.progress import Report, silent
@@ -110,20 +106,23 @@ class Plan:
 def build(config: BuildConfig, report: Report = silent) -> BuildSummary:
     """Make the store `config.out`; verdicts and splits are written at the end."""
     start = time.perf_counter()
+    if is_made_already(config.out, asdict(config)):
+        clear_leftovers(config.out)
+        return summarize(open_store(config.out), source=config.source)
     plan = plan_legacy(config, report) if config.source == "legacy-json" else plan_frames(config)
     workers = _num_workers(config.workers, plan.num_items // (2 * plan.chunk))
     problems = list(plan.problems)
     with StoreWriter(config.out, source=plan.source, resume_key=plan.resume_key) as writer:
         write_run(config.out, asdict(config))
         work, items = plan.start(writer.ids())
-        for done, result in enumerate(_run(work, items, workers, plan.chunk), start=1):
-            for record in result.records:
-                writer.append(record)
-            problems += result.problems
-            report("build", done, plan.num_items, f"{len(writer)} candidates")
-    store = open_store(config.out)
-    judge_store(store, plan.filters)
-    summary = summarize(store, source=plan.source)
+        with closing(ordered_map(work, items, workers=workers, chunk=plan.chunk)) as results:
+            for done, result in enumerate(results, start=1):
+                for record in result.records:
+                    writer.append(record)
+                problems += result.problems
+                report("build", done, plan.num_items, f"{len(writer)} candidates")
+        judge_and_split(writer, plan.filters)
+    summary = summarize(open_store(config.out), source=plan.source)
     return replace(summary, problems=tuple(problems), seconds=time.perf_counter() - start)
 
 
@@ -180,14 +179,24 @@ def open_source(config: BuildConfig) -> Source:
     )
 
 
+def judge_and_split(writer: StoreWriter, recipe: FilterRecipe) -> None:
+    """Verdicts and splits of all that was written: before the writer closes, so that "finished" comes last.
+
+    A run killed before that is unfinished and goes on when it is started again.
+    """
+    writer.flush()
+    store = open_store(writer.path, lock=writer.lock)
+    judge_store(store, recipe)
+    write_splits(store)
+
+
 def judge_store(store: PatchStore, recipe: FilterRecipe) -> None:
     """Judge every patch again by its stored values and replace the store's verdicts."""
     store.write_verdicts(judge(record, recipe) for record in store.light_records())
 
 
 def summarize(store: PatchStore, *, source: str) -> BuildSummary:
-    """Write the splits over the kept patches and count everything."""
-    splits = write_splits(store)
+    """Count everything in a finished store."""
     info = store.info()
     return BuildSummary(
         out=store.path,
@@ -196,7 +205,7 @@ def summarize(store: PatchStore, *, source: str) -> BuildSummary:
         kept=info["kept"],
         instances=info["kept_instances"],
         reasons=info["reasons"],
-        splits=splits,
+        splits={name: {part: parts.get(part, 0) for part in PARTS} for name, parts in info["splits"].items()},
     )
 
 
@@ -210,28 +219,3 @@ def _num_workers(workers: int, most: int) -> int:
     if workers < 0:
         raise InputError(f"--workers must be 0 (one per core) or more, found {workers}")
     return min(workers or os.cpu_count() or 1, max(1, most))  # a process takes seconds to start
-
-
-def _run(
-    work: Callable[[Any], FrameResult], items: Iterable[Any], workers: int, chunk_size: int
-) -> Iterator[FrameResult]:
-    """Results in the order of `items`, which are taken as they are needed."""
-    if workers == 1:
-        yield from map(work, items)
-        return
-    context = multiprocessing.get_context("spawn")  # torch and onnxruntime have threads: forking them is not safe
-    left = iter(items)
-    with ProcessPoolExecutor(workers, mp_context=context) as pool:
-        waiting: deque[Future[list[FrameResult]]] = deque()
-        while chunk := list(islice(left, chunk_size)):
-            waiting.append(pool.submit(_work, work, chunk))
-            if len(waiting) > 2 * workers:  # keeps memory bounded
-                yield from waiting.popleft().result()
-        while waiting:
-            yield from waiting.popleft().result()
-
-
-def _work(work: Callable[[Any], FrameResult], items: list[Any]) -> list[FrameResult]:
-    cv2.setNumThreads(1)  # one process per core, one thread per process
-    torch.set_num_threads(1)
-    return [work(item) for item in items]

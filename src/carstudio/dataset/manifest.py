@@ -81,6 +81,14 @@ def read_manifest(folder: Path) -> Manifest:
         raise InputError(f"{path}: broken manifest ({error!r}); rebuild the store or restore the file") from error
 
 
+def is_finished_store(folder: Path) -> bool:
+    """Whether a store is there whose writing was not interrupted."""
+    try:
+        return read_manifest(folder).is_finished
+    except InputError:
+        return False
+
+
 def _manifest_from_json(content: dict[str, Any]) -> Manifest:
     return Manifest(
         sources=tuple(content["sources"]),

@@ -7,7 +7,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from carstudio.files import write_json
+from carstudio.dataset.manifest import is_finished_store
+from carstudio.errors import InputError
+from carstudio.files import read_json, write_json
+
+CHANGES_NOTHING = ("out", "workers")  # settings that may differ between two runs with the same result
 
 
 def write_run(store_path: Path | str, config: dict[str, Any]) -> Path:
@@ -19,7 +23,33 @@ def write_run(store_path: Path | str, config: dict[str, Any]) -> Path:
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "carstudio": version("carstudio"),
         "command": sys.argv,
-        "config": json.loads(json.dumps(config, default=str)),
+        "config": _as_json(config),
     }
     write_json(path, run)
     return path
+
+
+def is_made_already(store_path: Path | str, config: dict[str, Any]) -> bool:
+    """Whether a finished store is there whose last run had this version and this configuration.
+
+    A job that was killed just after its last write is then done when it is started again, and not refused.
+    """
+    path = Path(store_path)
+    if not is_finished_store(path):
+        return False
+    runs = sorted((path / "runs").glob("[0-9]*.json"))
+    try:
+        last = read_json(runs[-1])
+        found, wanted = dict(last["config"]), _as_json(config)
+        is_same_version = last["carstudio"] == version("carstudio")
+    except (InputError, IndexError, KeyError, TypeError, ValueError):  # `runs/` may be missing: it is not the data's
+        return False
+    for name in CHANGES_NOTHING:
+        found.pop(name, None)
+        wanted.pop(name, None)
+    return is_same_version and found == wanted
+
+
+def _as_json(config: dict[str, Any]) -> dict[str, Any]:
+    value: dict[str, Any] = json.loads(json.dumps(config, default=str))
+    return value

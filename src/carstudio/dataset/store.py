@@ -5,6 +5,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property, lru_cache
 from itertools import islice
 from pathlib import Path
@@ -22,6 +23,7 @@ from carstudio.dataset.verdicts import VERDICT_SCHEMA, Verdict, table_from_verdi
 from carstudio.dataset.verify import verify_store
 from carstudio.dataset.writer import StoreWriter, describe_shard, shard_paths, write_tables
 from carstudio.errors import InputError
+from carstudio.locks import FolderLock
 
 __all__ = ["PatchStore", "StoreWriter", "open_store"]
 
@@ -38,16 +40,20 @@ class Location(NamedTuple):
     row: int
 
 
-def open_store(path: Path | str) -> "PatchStore":
-    """Open a store for reading; `InputError` when there is none or its format is newer than this program."""
-    return PatchStore(Path(path), read_manifest(Path(path)))
+def open_store(path: Path | str, *, lock: FolderLock | None = None) -> "PatchStore":
+    """Open a store for reading; `InputError` when there is none or its format is newer than this program.
+
+    Whoever holds the store's lock already (a `StoreWriter`) hands it over to write verdicts and splits as well.
+    """
+    return PatchStore(Path(path), read_manifest(Path(path)), lock)
 
 
 class PatchStore:
     """A store opened for reading; what it reads is cached, so open it again after writing. Can be pickled."""
 
-    def __init__(self, path: Path, manifest: Manifest) -> None:
+    def __init__(self, path: Path, manifest: Manifest, lock: FolderLock | None = None) -> None:
         self.path = path
+        self._lock = lock
         self.manifest = manifest
         self._pictures = lru_cache(_CACHED_GROUPS)(self._read_pictures)
         self._light = lru_cache(None)(self._read_light)  # some 600 bytes per patch: not read twice
@@ -172,7 +178,8 @@ class PatchStore:
                 self._check_known((verdict.patch_id for verdict in some), "verdicts")
                 yield table_from_verdicts(some)
 
-        write_tables(self.path / "verdicts.parquet", VERDICT_SCHEMA, tables())
+        with self._writing():
+            write_tables(self.path / "verdicts.parquet", VERDICT_SCHEMA, tables())
 
     def split_names(self) -> list[str]:
         """Names of the splits this store has."""
@@ -196,7 +203,12 @@ class PatchStore:
         assert set(parts.values()) <= set(PARTS), set(parts.values())
         ids = [patch_id for patch_id in self._locations if patch_id in parts]
         table = pa.table({"patch_id": ids, "part": [parts[patch_id] for patch_id in ids]}, schema=_SPLIT_SCHEMA)
-        write_tables(self.path / "splits" / f"{name}.parquet", _SPLIT_SCHEMA, [table])
+        with self._writing():
+            write_tables(self.path / "splits" / f"{name}.parquet", _SPLIT_SCHEMA, [table])
+
+    def _writing(self) -> AbstractContextManager[object]:
+        """The store's lock, taken for one write unless its holder opened this store."""
+        return nullcontext() if self._lock is not None and self._lock.is_held else FolderLock(self.path)
 
     def _check_known(self, patch_ids: Iterable[str], what: str) -> None:
         unknown = [patch_id for patch_id in patch_ids if patch_id not in self._locations]

@@ -16,7 +16,8 @@ from carstudio.dataset.manifest import Manifest, Shard, read_manifest, write_man
 from carstudio.dataset.patch import PatchRecord
 from carstudio.dataset.schema import PICTURES, SCHEMA, check_id, table_from_records
 from carstudio.errors import InputError
-from carstudio.files import atomic_path, sha256_file
+from carstudio.files import atomic_path, is_partial, remove_partials, sha256_file
+from carstudio.locks import LOCK_NAME, FolderLock
 
 ROWS_PER_GROUP = 64  # what one random access reads
 GROUPS_PER_SHARD = 16  # 1,024 patches: what an interruption can lose
@@ -47,6 +48,11 @@ def shard_paths(folder: Path) -> list[Path]:
     return sorted((folder / "data").glob(SHARD_PATTERN))
 
 
+def side_tables(folder: Path) -> list[Path]:
+    """The verdicts and splits of a store that are there."""
+    return [path for path in (folder / "verdicts.parquet", *(folder / "splits").glob("*.parquet")) if path.exists()]
+
+
 @contextmanager
 def _shard_writer(path: Path) -> Iterator[Callable[[list[PatchRecord]], None]]:
     """A function that adds one row group to the shard; the shard gets its name when the block ends well."""
@@ -66,9 +72,10 @@ def _shard_writer(path: Path) -> Iterator[Callable[[list[PatchRecord]], None]]:
 class StoreWriter:
     """Adds patches to a new store (`mode="create"`) or to one that exists (`mode="append"`).
 
-    `create` on a store that never was finished goes on after its whole shards when both were given the same
-    `resume_key`, and starts over otherwise; `has(patch_id)` tells which patches need not be made again. Leaving the
-    `with` block by an exception keeps the whole shards and leaves the store unfinished.
+    The store is locked against other writers until the writer is closed. `create` on a store that never was finished
+    goes on after its whole shards when both were given the same `resume_key`, and starts over otherwise;
+    `has(patch_id)` tells which patches need not be made again. Leaving the `with` block by an exception keeps the
+    whole shards and leaves the store unfinished.
     """
 
     def __init__(
@@ -83,12 +90,19 @@ class StoreWriter:
         assert mode in ("create", "append"), mode
         self.path = Path(path)
         self._rows_per_shard = ROWS_PER_GROUP * groups_per_shard
+        self._previous_manifest(mode)  # refuses before anything is touched, the lock's file included
+        self.lock = FolderLock(self.path)
+        try:
+            self._begin(source, mode, resume_key)
+        except BaseException:
+            self.lock.release()
+            raise
+
+    def _begin(self, source: str, mode: str, resume_key: str | None) -> None:
         previous = self._previous_manifest(mode)
+        remove_partials(self.path)
         if mode == "create" and (resume_key is None or resume_key != previous.resume_key):
-            for shard in shard_paths(self.path):
-                shard.unlink()
-        for leftover in (self.path / "data").glob(".part-*.partial.parquet"):
-            leftover.unlink()
+            self._start_over(previous)
         sources = tuple(sorted({*previous.sources, source}))
         self._manifest = Manifest(sources, previous.shards, resume_key=resume_key)
         write_manifest(self.path, self._manifest)
@@ -97,12 +111,18 @@ class StoreWriter:
         self._ids = {patch_id for shard in shards for patch_id in _patch_ids(shard)}
         self._pending: list[PatchRecord] = []
 
+    def _start_over(self, previous: Manifest) -> None:
+        """Remove what another run left; a kill in between must not let that run go on with what is left of it."""
+        write_manifest(self.path, Manifest(previous.sources, resume_key=None))
+        for path in (*shard_paths(self.path), *side_tables(self.path)):
+            path.unlink()
+
     def _previous_manifest(self, mode: str) -> Manifest:
         if mode == "append":
             return read_manifest(self.path)
         if self.path.exists() and not self.path.is_dir():
             raise InputError(f"{self.path}: expected a folder for the store, found a file; choose another --out")
-        if not self.path.exists() or not any(self.path.iterdir()):
+        if not self.path.exists() or not any(_is_foreign(path) for path in self.path.iterdir()):
             return Manifest(())
         if not (self.path / "manifest.json").is_file():
             raise InputError(
@@ -136,9 +156,10 @@ class StoreWriter:
         self._ids.add(record.patch_id)
         self._pending.append(record)
         if len(self._pending) == self._rows_per_shard:
-            self._flush()
+            self.flush()
 
-    def _flush(self) -> None:
+    def flush(self) -> None:
+        """Write what was added so far as a shard, a small one perhaps: the store can be read whole from here on."""
         if not self._pending:
             return
         path = self.path / "data" / f"part-{self._num_shards:05d}.parquet"
@@ -149,12 +170,13 @@ class StoreWriter:
         self._num_shards += 1
 
     def close(self) -> None:
-        """Write the last shard and the checksums: the store is finished."""
-        self._flush()
+        """Write the last shard and the checksums: the store is finished, and others may write."""
+        self.flush()
         (self.path / "data").mkdir(exist_ok=True)
         finished = {shard.name: shard for shard in self._manifest.shards}
         shards = tuple(finished.get(path.name) or describe_shard(path) for path in shard_paths(self.path))
         write_manifest(self.path, Manifest(self._manifest.sources, shards, is_finished=True))
+        self.lock.release()
 
     def __enter__(self) -> "StoreWriter":
         return self
@@ -162,13 +184,27 @@ class StoreWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None:
-            self.close()
+        try:
+            if kind is None:
+                self.close()
+        finally:
+            self.lock.release()
+
+
+def _is_foreign(path: Path) -> bool:
+    """Whether a file in a store's folder tells of something else: not so what a killed start leaves behind."""
+    return path.name != LOCK_NAME and not is_partial(path)
 
 
 def describe_shard(path: Path) -> Shard:
     """Name, rows and checksum of a shard on disk."""
-    return Shard(path.name, pq.read_metadata(path).num_rows, sha256_file(path))
+    return Shard(path.name, count_patches(path), sha256_file(path))
+
+
+def count_patches(shard: Path) -> int:
+    """Patches in a shard on disk, from its last bytes."""
+    num_rows: int = pq.read_metadata(shard).num_rows
+    return num_rows
 
 
 def _patch_ids(shard: Path) -> list[str]:

@@ -70,6 +70,14 @@ def view_pairs(store: PatchStore, config: EvaluationConfig) -> list[ViewPair]:
     return pairs
 
 
+def can_score(store: PatchStore, config: EvaluationConfig) -> bool:
+    """Whether there is a view to score; novel-view needs a car with two."""
+    try:
+        return bool(view_pairs(store, config))
+    except InputError:
+        return False
+
+
 def _input_pool(store: PatchStore, config: EvaluationConfig, scored: list[str]) -> list[str]:
     if config.split == "view" and config.part == "test":
         return store.patch_ids(kept=True, split="view", part="train")

@@ -13,9 +13,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from carstudio.errors import InputError
+
 logger = logging.getLogger(__name__)
 
 RESNET34_HUB_NAME = "microsoft/resnet-34"
+DEPTHS, WIDTHS = [3, 4, 6, 3], [64, 128, 256, 512]  # of ResNet-34
 
 
 @dataclass(frozen=True)
@@ -46,16 +49,23 @@ class ResNet34Encoder(nn.Module):
         super().__init__()
         from transformers import ResNetConfig, ResNetModel
 
-        config = ResNetConfig(depths=[3, 4, 6, 3], hidden_sizes=[64, 128, 256, 512], layer_type="basic")
+        config = ResNetConfig(depths=DEPTHS, hidden_sizes=WIDTHS, layer_type="basic")
         backbone = ResNetModel(config)
         self.embedder = backbone.embedder.embedder  # conv1 + batch norm + relu
         self.pool = nn.MaxPool2d(kernel_size=3, stride=2, padding=1)
         self.stages = nn.ModuleList(backbone.encoder.stages[:3])
 
     def load_pretrained(self, name: str) -> None:
-        """ImageNet weights from the hub or a folder; raises OSError when they cannot be had."""
-        from transformers import ResNetModel
+        """Weights from the hub or a folder; OSError when there are none, `InputError` when they are no ResNet-34."""
+        from transformers import AutoConfig, ResNetModel
 
+        found = AutoConfig.from_pretrained(name)
+        sizes = [getattr(found, key, None) for key in ("model_type", "depths", "hidden_sizes", "layer_type")]
+        if sizes != ["resnet", DEPTHS, WIDTHS, "basic"]:
+            raise InputError(
+                f"{name}: expected a ResNet-34 (resnet, depths {DEPTHS}, widths {WIDTHS}, basic layers), found "
+                f"{sizes}; name another one or None for random weights"
+            )
         loaded = ResNetModel.from_pretrained(name)
         self.embedder.load_state_dict(loaded.embedder.embedder.state_dict())
         for ours, theirs in zip(self.stages, loaded.encoder.stages[:3], strict=True):

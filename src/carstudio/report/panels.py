@@ -1,8 +1,9 @@
 """Pictures of a model at work: rows of input, truth, rendering, opacity and depth; turntables."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,7 +11,7 @@ import torch
 from carstudio.dataset.patch import MaskValue
 from carstudio.dataset.pixels import PatchCache, PreparedPatch
 from carstudio.dataset.store import PatchStore
-from carstudio.evaluation.protocols import EvaluationConfig, ScoredView, score_views, view_pairs
+from carstudio.evaluation.protocols import EvaluationConfig, ScoredView, can_score, score_views, view_pairs
 from carstudio.geometry.box3d import Box3D
 from carstudio.geometry.orbit import orbit_box, orbit_camera, orbit_distance
 from carstudio.images import to_uint8, write_png
@@ -46,19 +47,12 @@ def views_sheet(views: Sequence[ScoredView], *, tile_px: tuple[int, int] = (192,
 
 def views_panel(model: CategoryModel, store: PatchStore, path: Path, split: str | None, count: int) -> None:
     """Write a sheet of `count` views the model was not trained on (of the training data when there are none)."""
-    part = "test" if split and store.patch_ids(split=split, part="test") else "all"
-    protocol = "novel-view" if _has_pairs(store, split, part) else "input-view"
-    config = EvaluationConfig(protocol=protocol, split=split, part=part, limit=count)  # type: ignore[arg-type]
+    part: Any = "test" if split and store.patch_ids(split=split, part="test") else "all"
+    config = EvaluationConfig(protocol="novel-view", split=split, part=part, limit=count)
+    if not can_score(store, config):
+        config = replace(config, protocol="input-view")
     views = list(score_views(model, store, view_pairs(store, config)))
     write_png(path, views_sheet(views))
-
-
-def _has_pairs(store: PatchStore, split: str | None, part: str) -> bool:
-    kept = set(store.patch_ids(split=split, part=part if split else "all"))
-    table = store.table(["patch_id", "instance_id"])
-    pairs = zip(table["patch_id"].to_pylist(), table["instance_id"].to_pylist(), strict=True)
-    instances = [instance for patch_id, instance in pairs if patch_id in kept]
-    return split == "view" or len(set(instances)) < len(instances)
 
 
 @dataclass(frozen=True)

@@ -9,15 +9,16 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 
 from carstudio.errors import InputError
-from carstudio.files import atomic_path, read_json, sha256_file, write_json
+from carstudio.files import read_json, sha256_file, write_bytes, write_json
 from carstudio.models.interface import CategoryModel
 from carstudio.models.zoo import ModelConfig, build_model, config_from_json, config_to_json
 
 FORMAT_VERSION = 1
 WEIGHTS, DESCRIPTION = "model.safetensors", "model.json"
+MAX_SIZE = 16_384  # of any whole number in a model's description: sixty times the paper's widest layer
 
 
 @dataclass(frozen=True)
@@ -46,8 +47,8 @@ def save_model(folder: Path, model: CategoryModel, config: ModelConfig, provenan
 def save_tensors(path: Path, tensors: dict[str, torch.Tensor], metadata: dict[str, str] | None = None) -> None:
     """Write tensors as safetensors, atomically."""
     on_cpu = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    with atomic_path(path) as partial:
-        save_file(on_cpu, partial, metadata=metadata)
+    # Not safetensors' own `save_file`: it writes to a temporary name of its own, which a kill leaves behind.
+    write_bytes(path, save(on_cpu, metadata=metadata))
 
 
 def load_tensors(path: Path) -> dict[str, torch.Tensor]:
@@ -81,23 +82,57 @@ def load_model(path_or_name: Path | str, *, device: torch.device | str = "cpu") 
     tensors = load_tensors(folder / WEIGHTS)
     if sha256_file(folder / WEIGHTS) != description.sha256:
         raise InputError(
-            f"{folder / WEIGHTS}: sha256 differs from the one in {DESCRIPTION}; the two do not belong together"
+            f"{folder / WEIGHTS}: sha256 differs from the one in {DESCRIPTION}; the two do not belong together. "
+            "Where a kill cut a checkpoint off, `carstudio train ... --resume` writes both again"
         )
+    _check_before_building(description.config, tensors, folder)
     model = build_model(description.config)
     load_weights(model, tensors, name=str(folder / WEIGHTS))
     return model.to(device).eval()
 
 
+def _check_before_building(config: ModelConfig, tensors: dict[str, torch.Tensor], folder: Path) -> None:
+    """Refuse a description whose sizes are absurd, or are not the weights', before memory is taken for them."""
+    too_large = _sizes_beyond(config_to_json(config), "config")
+    if too_large:
+        raise InputError(
+            f"{folder / DESCRIPTION}: {too_large[0]} must lie between 0 and {MAX_SIZE}; the file is damaged or foreign"
+        )
+    with torch.device("meta"):
+        expected = build_model(config).state_dict()
+    _check_names_and_shapes(expected, tensors, name=str(folder / WEIGHTS))
+
+
+def _sizes_beyond(value: Any, name: str) -> list[str]:
+    if isinstance(value, dict):
+        return [found for key, item in value.items() for found in _sizes_beyond(item, f"{name}.{key}")]
+    return [f"{name} = {value}"] if isinstance(value, int) and not 0 <= value <= MAX_SIZE else []
+
+
+def load_weights_of(folder: Path, model: CategoryModel, config: ModelConfig) -> str:
+    """Give `model` the weights of another run of the same model config; says in words what it now starts from."""
+    description = describe_model(folder)
+    if description.config != config:
+        theirs, ours = config_to_json(description.config), config_to_json(config)
+        different = [key for key in ours if theirs.get(key) != ours[key]]
+        raise InputError(f"{folder}: its model differs from the recipe's in {different}; start from the same recipe")
+    load_weights(model, load_tensors(folder / WEIGHTS), name=str(folder / WEIGHTS))
+    return f"weights {description.sha256[:16]} of {folder.name}"
+
+
 def load_weights(model: torch.nn.Module, tensors: dict[str, torch.Tensor], *, name: str) -> None:
     """`load_state_dict` with an error a user can read: names what is missing, left over or of another shape."""
-    expected = model.state_dict()
+    _check_names_and_shapes(model.state_dict(), tensors, name=name)
+    model.load_state_dict(tensors)
+
+
+def _check_names_and_shapes(expected: dict[str, torch.Tensor], tensors: dict[str, torch.Tensor], *, name: str) -> None:
     missing, extra = sorted(expected.keys() - tensors.keys()), sorted(tensors.keys() - expected.keys())
     if missing or extra:
         raise InputError(f"{name}: weights of another model: missing {missing[:4]}, left over {extra[:4]}")
     for key, tensor in tensors.items():
         if tensor.shape != expected[key].shape:
             raise InputError(f"{name}: {key} has shape {list(tensor.shape)}, expected {list(expected[key].shape)}")
-    model.load_state_dict(tensors)
 
 
 def pick_device(name: str) -> torch.device:

@@ -16,20 +16,23 @@ STATE = "training.safetensors"
 
 @dataclass(frozen=True)
 class TrainingState:
-    """Tensors named `model.NAME` and `optimizer.PARAMETER.SLOT`, the finished steps and the seconds they took."""
+    """Tensors `model.NAME` and `optimizer.PARAMETER.SLOT`, finished steps, their seconds, what the run began with."""
 
     tensors: dict[str, Tensor]
     step: int
     seconds: float
+    starts_from: str
 
     @classmethod
-    def of(cls, model: nn.Module, optimizer: torch.optim.Optimizer, *, step: int, seconds: float) -> "TrainingState":
+    def of(
+        cls, model: nn.Module, optimizer: torch.optim.Optimizer, *, step: int, seconds: float, starts_from: str
+    ) -> "TrainingState":
         """Collect the state of a run."""
         tensors = {f"model.{name}": tensor for name, tensor in model.state_dict().items()}
         for name, parameter in model.named_parameters():
             for slot, value in optimizer.state.get(parameter, {}).items():
                 tensors[f"optimizer.{name}.{slot}"] = value
-        return cls(tensors, step, seconds)
+        return cls(tensors, step, seconds, starts_from)
 
     def into(self, model: nn.Module, optimizer: torch.optim.Optimizer) -> None:
         """Put the state back."""
@@ -46,8 +49,19 @@ class TrainingState:
 
 def save_state(folder: Path, state: TrainingState) -> None:
     """Write the state atomically."""
-    metadata = {"step": json.dumps(state.step), "seconds": json.dumps(state.seconds)}
+    metadata = {"step": json.dumps(state.step), "seconds": json.dumps(state.seconds), "starts_from": state.starts_from}
     save_tensors(folder / STATE, state.tensors, metadata)
+
+
+def has_state(folder: Path) -> bool:
+    """Whether a run can be resumed."""
+    return (folder / STATE).exists()
+
+
+def saved_step(folder: Path) -> int:
+    """The step a run would go on from, read from the header alone."""
+    with safe_open(folder / STATE, "pt") as file:
+        return int((file.metadata() or {}).get("step", 0))
 
 
 def load_state(folder: Path) -> TrainingState:
@@ -59,6 +73,8 @@ def load_state(folder: Path) -> TrainingState:
     with safe_open(path, "pt") as file:
         metadata = file.metadata() or {}
     try:
-        return TrainingState(tensors, int(metadata["step"]), float(metadata["seconds"]))
+        return TrainingState(
+            tensors, int(metadata["step"]), float(metadata["seconds"]), metadata.get("starts_from", "")
+        )
     except (KeyError, ValueError) as error:
         raise InputError(f"{path}: header lacks step or seconds ({error}); it is no training state") from error

@@ -12,7 +12,9 @@ import torch
 
 from carstudio.dataset.pixels import PatchCache
 from carstudio.dataset.store import PatchStore
-from carstudio.errors import InputError
+from carstudio.errors import InputError, Interrupted
+from carstudio.files import remove_partials
+from carstudio.locks import LOCK_NAME, FolderLock
 from carstudio.models.car_nerf import CarNeRFConfig
 from carstudio.models.interface import CategoryModel
 from carstudio.models.zoo import ModelConfig, build_model
@@ -20,10 +22,11 @@ from carstudio.progress import Report, silent
 from carstudio.rendering.rays import to_canonical
 from carstudio.rendering.volume import composite
 from carstudio.training.batches import StepSampler, Supervision, generator_for
-from carstudio.training.checkpoint import pick_device, save_model
-from carstudio.training.log import TrainingLog
+from carstudio.training.checkpoint import describe_model, load_weights_of, pick_device, save_model
+from carstudio.training.log import LOG, TrainingLog
 from carstudio.training.losses import LossConfig, masked_psnr, training_loss
-from carstudio.training.resume import TrainingState, load_state, save_state
+from carstudio.training.precision import Precision, autocast, resolve_precision
+from carstudio.training.resume import STATE, TrainingState, load_state, save_state
 from carstudio.training.schedule import ScheduleConfig, learning_rate
 
 
@@ -51,6 +54,8 @@ class TrainConfig:
     """Stop after this much time instead, and let the learning rate follow the clock."""
     clip_gradient: float | None = None
     """Largest gradient norm; None: not clipped, as released."""
+    precision: Precision = "float32"
+    """Number format of matrix products; "auto": bfloat16 where the device has matrix units for it."""
     seed: int = 0
     """Start of all randomness."""
     split: str | None = "instance"
@@ -70,7 +75,8 @@ class TrainSummary:
     seconds: float
     rays_per_s: float
     psnr: float
-    encoder_start: str
+    starts_from: str
+    precision: str
     sha256: str
 
 
@@ -81,29 +87,65 @@ def train(
     *,
     device: str = "auto",
     resume: bool = False,
+    init: Path | None = None,
     provenance: dict[str, Any] | None = None,
     report: Report = silent,
     on_save: Callable[[CategoryModel, int], None] | None = None,
+    should_stop: Callable[[], bool] = lambda: False,
 ) -> TrainSummary:
     """Train a model on a store's kept patches and leave it in `out` (model, log, state to resume from).
 
-    `on_save(model, step)` is called after each checkpoint, for pictures. Killed at any moment and resumed, a run by
-    steps ends with the same bits on a CPU as an uninterrupted one.
+    `init` is a trained model of the same config whose weights the run starts from (a resumed run has its own).
+    `on_save(model, step)` is called after each checkpoint, for pictures. Once `should_stop()` is true, the state of the
+    finished step is saved and `Interrupted` raised. Killed at any moment and resumed, a run by steps ends with the same
+    bits on a CPU as an uninterrupted one (a run by minutes follows the clock). `out` is locked while it is written.
     """
-    run = _Run(config, store, out, pick_device(device), resume, provenance or {})
-    try:
-        while not run.is_done():
-            figures = run.one_step()
-            if run.step % config.log_every == 0 or run.is_done():
-                run.log(figures)
-            report("training", *run.progress(), f"PSNR {run.psnr:.2f} dB  {run.rays_per_s:,.0f} rays/s")
-            if run.step % config.save_every == 0 or run.is_done():
-                run.save()
-                if on_save is not None:
-                    on_save(run.model, run.step)
-    finally:
-        run.close()
+    run = _Run(config, store, out, pick_device(device), provenance or {})
+    refuse_wrong_start(out, resume=resume)
+    with FolderLock(out):
+        remove_partials(out)
+        run.begin(init=init)
+        try:
+            _steps(run, report, on_save or _draw_nothing, should_stop)
+        finally:
+            run.close()
     return run.summary()
+
+
+def _steps(
+    run: "_Run", report: Report, on_save: Callable[[CategoryModel, int], None], should_stop: Callable[[], bool]
+) -> None:
+    """From where the run stands to its end."""
+    is_done = run.is_done()
+    if is_done:
+        run.save()  # resumed at its end: the model may be that of an earlier step
+    if is_done or (run.step > 0 and run.step % run.config.save_every == 0):
+        on_save(run.model, run.step)  # a kill may have come between the checkpoint and its picture
+    while not is_done:
+        figures = run.one_step()
+        is_done = run.is_done()  # asked once per step: the clock runs on
+        if run.step % run.config.log_every == 0 or is_done:
+            run.log(figures)
+        report("training", *run.progress(), f"PSNR {run.psnr:.2f} dB  {run.rays_per_s:,.0f} rays/s")
+        if run.step % run.config.save_every == 0 or is_done:
+            run.save()
+            on_save(run.model, run.step)
+        if not is_done and should_stop():
+            run.save_state()
+            raise Interrupted
+
+
+def _draw_nothing(model: CategoryModel, step: int) -> None:
+    """The default of `on_save`."""
+
+
+def refuse_wrong_start(out: Path, *, resume: bool) -> None:
+    """`InputError` when there is a checkpoint and no --resume, or neither a checkpoint nor a sign of a run begun."""
+    if (out / STATE).exists():
+        if not resume:
+            raise InputError(f"{out} holds a run already; add --resume to go on with it, or choose another --out")
+    elif resume and not any((out / name).exists() for name in (LOCK_NAME, LOG)):
+        raise InputError(f"{out}: nothing to resume ({STATE} is missing); start without --resume")
 
 
 class _Run:
@@ -115,7 +157,6 @@ class _Run:
         store: PatchStore,
         out: Path,
         device: torch.device,
-        resume: bool,
         provenance: dict[str, Any],
     ) -> None:
         self.config, self.out, self.device, self.provenance = config, out, device, provenance
@@ -124,15 +165,9 @@ class _Run:
             raise InputError(f"{store.path}: no kept patch in the training part of split {config.split!r}")
         torch.manual_seed(config.seed)
         self.model = build_model(config.model).to(device)
-        self.encoder_start = "resumed"
+        self.starts_from = ""
         self.optimizer = torch.optim.RAdam(self.model.parameters(), lr=config.schedule.first, eps=1e-8)
         self.step, self.seconds, self.psnr, self.rays_per_s = 0, 0.0, math.nan, 0.0
-        if resume:
-            self._restore(load_state(out))
-        elif (out / "training.safetensors").exists():
-            raise InputError(f"{out} holds a run already; add --resume to go on with it, or choose another --out")
-        else:
-            self.encoder_start = self.model.load_pretrained_parts()
         cache = PatchCache(store, self.model.encoder_side_px)
         self.sampler = StepSampler(
             cache,
@@ -141,14 +176,24 @@ class _Run:
             supervision=config.supervision,
             seed=config.seed,
         )
-        self.trainlog = TrainingLog(out, resume_step=self.step)
+
+    def begin(self, *, init: Path | None) -> None:
+        """Put the first weights in place (the last checkpoint's if there is one), open the log, start the clocks."""
+        if (self.out / STATE).exists():
+            self._restore(load_state(self.out))
+        elif init is not None:
+            self.starts_from = load_weights_of(init, self.model, self.config.model)
+        else:
+            self.starts_from = f"encoder from {self.model.load_pretrained_parts()}"
+        self.trainlog = TrainingLog(self.out, resume_step=self.step)
+        self.psnr = self.trainlog.last_row.get("psnr", math.nan)
         self._resumed_step, self._resumed_seconds = self.step, self.seconds
         self._started = time.monotonic()
         self._processor_started = time.process_time()
 
     def _restore(self, state: TrainingState) -> None:
         state.into(self.model, self.optimizer)
-        self.step, self.seconds = state.step, state.seconds
+        self.step, self.seconds, self.starts_from = state.step, state.seconds, state.starts_from
 
     def fraction(self) -> float:
         """Share of the run's budget that is spent."""
@@ -179,8 +224,9 @@ class _Run:
         jitter = generator_for(config.seed, self.step, "jitter")
 
         self.model.train()
-        latents = self.model.encode(patches)
-        levels = self.model.trace_levels(pixels.rays, latents, pixels.box, jitter)
+        with autocast(config.precision, self.device):
+            latents = self.model.encode(patches)
+            levels = self.model.trace_levels(pixels.rays, latents, pixels.box, jitter)
         renderings = tuple(composite(segments) for segments in levels)
         counts = pixels.is_known & to_canonical(pixels.rays, pixels.box).hit
         terms = training_loss(renderings, pixels.rgb, pixels.alpha, counts, config.loss)
@@ -206,7 +252,9 @@ class _Run:
         if broken:
             raise FloatingPointError(
                 f"step {self.step}: loss term {broken[0]} is {figures[broken[0]]} for cars {list(instance_ids)}; "
-                f"the last checkpoint in {self.out} is sound: lower the learning rate and --resume"
+                f"the weights are not changed by it. The last checkpoint in {self.out} is sound, but going on from it "
+                "meets the same numbers again: resume with another --seed (other batches from there on), or start "
+                "with a lower learning rate or clipped gradients (recipes.py)"
             )
 
     def log(self, figures: dict[str, float]) -> None:
@@ -217,15 +265,25 @@ class _Run:
         self.trainlog.write(row)
 
     def save(self) -> None:
-        """The model for its users, then the state to resume from."""
+        """The model for its users and the log, then the state: what goes on from it finds the others there."""
         provenance = {
             **self.provenance,
             "recipe": self.config.recipe,
             "training": dataclasses.asdict(self.config),
+            "precision": resolve_precision(self.config.precision, self.device),
+            "starts_from": self.starts_from,
             "step": self.step,
         }
-        self.checksum = save_model(self.out, self.model, self.config.model, provenance)
-        save_state(self.out, TrainingState.of(self.model, self.optimizer, step=self.step, seconds=self.seconds))
+        save_model(self.out, self.model, self.config.model, provenance)
+        self.save_state()
+
+    def save_state(self) -> None:
+        """What the run goes on from; the log reaches the disk before it."""
+        self.trainlog.sync()
+        state = TrainingState.of(
+            self.model, self.optimizer, step=self.step, seconds=self.seconds, starts_from=self.starts_from
+        )
+        save_state(self.out, state)
 
     def close(self) -> None:
         self.trainlog.close()
@@ -237,6 +295,7 @@ class _Run:
             seconds=round(self.seconds, 3),
             rays_per_s=round(self.rays_per_s, 1),
             psnr=round(self.psnr, 3),
-            encoder_start=self.encoder_start,
-            sha256=self.checksum,
+            starts_from=self.starts_from,
+            precision=resolve_precision(self.config.precision, self.device),
+            sha256=describe_model(self.out).sha256,
         )

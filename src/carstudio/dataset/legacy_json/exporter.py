@@ -16,8 +16,8 @@ from carstudio.dataset.legacy_json.made import Namer, dataset_name, made_mask, m
 from carstudio.dataset.legacy_json.verbatim import Verbatim, unpack_extra
 from carstudio.dataset.patch import PatchRecord
 from carstudio.dataset.store import PatchStore
-from carstudio.errors import InputError
-from carstudio.files import atomic_path, inside, write_text
+from carstudio.errors import InputError, StorageError
+from carstudio.files import atomic_path, inside, remove_partials, write_text
 from carstudio.progress import Report, silent
 
 UNFINISHED = ".unfinished-export"  # lies in the folder until the export is whole
@@ -88,14 +88,9 @@ def export_legacy(
     store: PatchStore, out: Path, *, patches: Literal["kept", "all"] = "kept", report: Report = silent
 ) -> ExportSummary:
     """Write the store's patches in the authors' layout below `out`, a new or empty folder."""
-    try:
-        _begin(out)
-        summary = _export(store, out, frozenset(store.patch_ids(kept=patches == "kept")), report)
-        (out / UNFINISHED).unlink()
-    except OSError as error:
-        raise InputError(
-            f"{error.filename or out}: cannot be written ({error.strerror}); choose another --out"
-        ) from error
+    _begin(out)
+    summary = _export(store, out, frozenset(store.patch_ids(kept=patches == "kept")), report)
+    (out / UNFINISHED).unlink()
     return summary
 
 
@@ -104,6 +99,8 @@ def _begin(out: Path) -> None:
         raise InputError(f"{out}: expected a folder to export to, found a file; choose another --out")
     if out.is_dir() and any(out.iterdir()) and not (out / UNFINISHED).exists():
         raise InputError(f"{out}: holds other files; choose a new or an empty folder for --out")
+    if out.is_dir():
+        remove_partials(out)
     write_text(out / UNFINISHED, "carstudio dataset export was interrupted here; the same command finishes it\n")
 
 
@@ -186,13 +183,15 @@ def _write_picture(out: Path, name: str, data: bytes) -> None:
     path = inside(out, name)
     if path.suffix == ".json" or path.name == UNFINISHED:
         raise InputError(f"picture {name!r}: expected a name of a picture, such as patch/km_0100097004_patch.png")
-    if path.exists():
-        if path.read_bytes() != data:
+    try:
+        if path.exists() and path.read_bytes() != data:
             raise InputError(
                 f"{path}: two patches want this file with other content, or it is broken; remove the folder"
             )
-        return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.name}.partial")  # no fsync: a million of them would take an hour
-    partial.write_bytes(data)
-    partial.replace(path)
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            partial = path.with_name(f".{path.name}.partial")  # no fsync: a million of them would take an hour
+            partial.write_bytes(data)
+            partial.replace(path)
+    except OSError as error:
+        raise StorageError(path, error.strerror) from error

@@ -6,32 +6,32 @@ run that was cut off goes on after its whole shards.
 
 import hashlib
 import json
-import multiprocessing
 import os
 import time
-from collections.abc import Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterable
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
-import cv2
 import numpy as np
 import torch
 
-from carstudio.dataset.build import judge_store, summarize
+from carstudio.dataset.build import judge_and_split, summarize
 from carstudio.dataset.candidates import crop_window
 from carstudio.dataset.filters import FilterRecipe
 from carstudio.dataset.patch import MaskValue, PatchRecord
-from carstudio.dataset.runs import write_run
+from carstudio.dataset.runs import is_made_already, write_run
 from carstudio.dataset.store import StoreWriter, open_store
 from carstudio.dataset.summary import BuildSummary
+from carstudio.dataset.workers import ordered_map
 from carstudio.errors import InputError
 from carstudio.geometry.box3d import envelope
 from carstudio.geometry.overlap import box2d_iou
 from carstudio.geometry.transforms import quaternion_from_rotation
 from carstudio.images import encode_depth, encode_png
+from carstudio.locks import clear_leftovers
 from carstudio.progress import Report, silent
 from carstudio.synthetic.benchmark import BENCHMARK_CARS, BENCHMARK_SEED, BENCHMARK_SIZE_PX, BENCHMARK_VIEWS
 from carstudio.synthetic.cameras import CameraKind
@@ -89,18 +89,22 @@ def synthesize(config: SynthConfig, report: Report = silent) -> BuildSummary:
     """Make the store `config.out`: every photo is kept; the splits are written."""
     start = time.perf_counter()
     _check(config)
+    if is_made_already(config.out, asdict(config)):
+        clear_leftovers(config.out)
+        return summarize(open_store(config.out), source=SOURCE)
     files = mesh_files(config.meshes)
     with StoreWriter(config.out, source=SOURCE, resume_key=_resume_key(config, files)) as writer:
         write_run(config.out, asdict(config))
         todo = [i for i in range(config.cars) if not all(writer.has(name) for name in patch_ids(config, i))]
-        for done, records in enumerate(_run(config, files, todo), start=1 + config.cars - len(todo)):
-            for record in records:
-                if not writer.has(record.patch_id):
-                    writer.append(record)
-            report("photograph", done, config.cars, f"{len(writer)} photos")
-    store = open_store(config.out)
-    judge_store(store, KEEP_ALL)
-    summary = summarize(store, source=SOURCE)
+        work, workers = partial(car_records, config, files), _num_workers(config, len(todo))
+        with closing(ordered_map(work, todo, workers=workers)) as photographed:
+            for done, records in enumerate(photographed, start=1 + config.cars - len(todo)):
+                for record in records:
+                    if not writer.has(record.patch_id):
+                        writer.append(record)
+                report("photograph", done, config.cars, f"{len(writer)} photos")
+        judge_and_split(writer, KEEP_ALL)
+    summary = summarize(open_store(config.out), source=SOURCE)
     return replace(summary, seconds=time.perf_counter() - start)
 
 
@@ -164,22 +168,8 @@ def _resume_key(config: SynthConfig, files: list[Path]) -> str:
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
 
 
-def _run(config: SynthConfig, files: list[Path], todo: list[int]) -> Iterator[tuple[PatchRecord, ...]]:
-    """Records car by car, in order."""
-    workers = min(config.workers or os.cpu_count() or 1, max(1, len(todo) // 4))  # a process takes seconds to start
-    work = partial(car_records, config, files)
-    if workers == 1:
-        yield from map(work, todo)
-        return
-    context = multiprocessing.get_context("spawn")  # torch has threads: forking them is not safe
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_one_thread) as pool:
-        yield from pool.map(work, todo)
-
-
-def _one_thread() -> None:
-    """One process per core, one thread per process."""
-    cv2.setNumThreads(1)
-    torch.set_num_threads(1)
+def _num_workers(config: SynthConfig, num_cars: int) -> int:
+    return min(config.workers or os.cpu_count() or 1, max(1, num_cars // 4))  # a process takes seconds to start
 
 
 def patch_ids(config: SynthConfig, index: int) -> list[str]:

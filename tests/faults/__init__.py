@@ -1,0 +1,1 @@
+"""Faults on purpose: kills at any moment, stop signals, full disks, read-only folders, two writers at once."""
