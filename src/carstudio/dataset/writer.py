@@ -4,7 +4,7 @@ A shard is written to a temporary file and renamed when it is complete. The mani
 from the first moment to `close`; a store cut off in between opens with the shards that are there.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -37,10 +37,11 @@ _SMALL_LEAVES = [leaf for leaf in _LEAVES if not leaf.endswith(".bytes")]
 _COMPRESSION = {leaf: "zstd" if leaf in _SMALL_LEAVES else "none" for leaf in _LEAVES}
 
 
-def write_table(path: Path, table: pa.Table) -> None:
-    """Write a small side table (verdicts, a split) atomically."""
-    with atomic_path(path) as partial:
-        pq.write_table(table, partial, compression="zstd")
+def write_tables(path: Path, schema: pa.Schema, tables: Iterable[pa.Table]) -> None:
+    """Write a side table (verdicts, a split) atomically, a row group for each of `tables`, taken as they come."""
+    with atomic_path(path) as partial, pq.ParquetWriter(partial, schema, compression="zstd") as writer:
+        for table in tables:
+            writer.write_table(table)
 
 
 def shard_paths(folder: Path) -> list[Path]:
