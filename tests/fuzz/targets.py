@@ -134,7 +134,7 @@ def read_damaged_manifest(data: bytes, folder: Path) -> None:
     """Shards named inside the store, counts not negative."""
     (folder / "manifest.json").write_bytes(data)
     manifest = read_manifest(folder)
-    assert all(shard.rows >= 0 and "/" not in shard.name for shard in manifest.shards), manifest
+    assert all(shard.num_patches >= 0 and "/" not in shard.name for shard in manifest.shards), manifest
 
 
 def store_seeds(folder: Path) -> list[bytes]:

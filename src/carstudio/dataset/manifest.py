@@ -1,6 +1,7 @@
 """A store's `manifest.json`: format version, counts, checksums; nothing about when or where it was made."""
 
 import hashlib
+import re
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from carstudio.files import read_json, write_json
 
 FORMAT = "carpatch3d"
 FORMAT_VERSION = 1
+_SHARD_NAME = re.compile(r"[\w.-]+")
 
 
 @dataclass(frozen=True)
@@ -89,10 +91,19 @@ def is_finished_store(folder: Path) -> bool:
         return False
 
 
+def _shard_from_json(value: dict[str, Any]) -> Shard:
+    shard = Shard(**value)
+    if not (isinstance(shard.name, str) and _SHARD_NAME.fullmatch(shard.name) and isinstance(shard.sha256, str)):
+        raise TypeError(f"shard {value!r}: expected the name of a file in data/ and its sha256")
+    if isinstance(shard.num_patches, bool) or not isinstance(shard.num_patches, int) or shard.num_patches < 0:
+        raise TypeError(f"shard {shard.name}: num_patches must be 0 or more, found {shard.num_patches!r}")
+    return shard
+
+
 def _manifest_from_json(content: dict[str, Any]) -> Manifest:
     return Manifest(
-        sources=tuple(content["sources"]),
-        shards=tuple(Shard(**shard) for shard in content["shards"]),
+        sources=tuple(str(source) for source in content["sources"]),
+        shards=tuple(_shard_from_json(shard) for shard in content["shards"]),
         is_finished=bool(content["is_finished"]),
         resume_key=content.get("resume_key"),
         format_version=content["format_version"],

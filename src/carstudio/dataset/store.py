@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 
 from carstudio.dataset.manifest import Manifest, data_sha256, read_manifest
 from carstudio.dataset.patch import Patch, PatchRecord
+from carstudio.dataset.reading import reading
 from carstudio.dataset.schema import LIGHT_COLUMNS, PICTURES, SCHEMA, check_id, record_from_row
 from carstudio.dataset.summary import sort_reasons
 from carstudio.dataset.verdicts import VERDICT_SCHEMA, Verdict, table_from_verdicts, verdicts_from_table
@@ -66,12 +67,16 @@ class PatchStore:
         return sum(file.metadata.num_rows for file in self._files)
 
     @cached_property
-    def _files(self) -> list[pq.ParquetFile]:
+    def _paths(self) -> list[Path]:
         paths = shard_paths(self.path)
         missing = {shard.name for shard in self.manifest.shards} - {path.name for path in paths}
         if missing:
             raise InputError(f"{self.path}: shards {sorted(missing)} are missing; restore them or rebuild the store")
-        return [_open_shard(path) for path in paths]
+        return paths
+
+    @cached_property
+    def _files(self) -> list[pq.ParquetFile]:
+        return [_open_shard(path) for path in self._paths]
 
     @cached_property
     def data_sha256(self) -> str:
@@ -88,13 +93,15 @@ class PatchStore:
             raise InputError(f"{self.path}: no column {unknown}; there are {self._files[0].schema_arrow.names}")
         if not self._files:
             return SCHEMA.empty_table().select(columns)
-        return pa.concat_tables([file.read(columns=columns) for file in self._files])
+        with reading(self.path / "data"):
+            return pa.concat_tables([file.read(columns=columns) for file in self._files])
 
     @cached_property
     def _locations(self) -> dict[str, Location]:
         locations: dict[str, Location] = {}
         for shard, file in enumerate(self._files):
-            ids = file.read(columns=["patch_id"])["patch_id"].to_pylist()
+            with reading(self._paths[shard]):
+                ids = file.read(columns=["patch_id"])["patch_id"].to_pylist()
             start = 0
             for group in range(file.num_row_groups):
                 stop = start + file.metadata.row_group(group).num_rows
@@ -119,10 +126,14 @@ class PatchStore:
         return list(ids)
 
     def _read_pictures(self, shard: int, group: int) -> pa.Table:
-        return self._files[shard].read_row_group(group, columns=list(PICTURES), use_threads=False)
+        return self._read_group(shard, group, PICTURES)
 
     def _read_light(self, shard: int, group: int) -> pa.Table:
-        return self._files[shard].read_row_group(group, columns=list(LIGHT_COLUMNS), use_threads=False)
+        return self._read_group(shard, group, LIGHT_COLUMNS)
+
+    def _read_group(self, shard: int, group: int, columns: Iterable[str]) -> pa.Table:
+        with reading(self._paths[shard]):
+            return self._files[shard].read_row_group(group, columns=list(columns), use_threads=False)
 
     def record(self, patch_id: str) -> PatchRecord:
         """One patch as stored."""
@@ -137,14 +148,18 @@ class PatchStore:
 
     def light_records(self) -> Iterator[PatchRecord]:
         """All candidates in store order without their pictures (`image` is empty): for filters."""
-        for file in self._files:
-            yield from map(record_from_row, file.read(columns=list(LIGHT_COLUMNS)).to_pylist())
+        for path, file in zip(self._paths, self._files, strict=True):
+            with reading(path):
+                rows = file.read(columns=list(LIGHT_COLUMNS)).to_pylist()
+            yield from map(record_from_row, rows)
 
     def records(self) -> Iterator[PatchRecord]:
         """All candidates in store order, kept or not, with their pictures; one row group is in memory at a time."""
-        for file in self._files:
+        for path, file in zip(self._paths, self._files, strict=True):
             for group in range(file.num_row_groups):
-                yield from map(record_from_row, file.read_row_group(group, use_threads=False).to_pylist())
+                with reading(path):
+                    rows = file.read_row_group(group, use_threads=False).to_pylist()
+                yield from map(record_from_row, rows)
 
     def patch(self, patch_id: str) -> Patch:
         """One patch decoded."""
@@ -255,10 +270,16 @@ _SPLIT_SCHEMA = pa.schema(
 
 
 def _open_shard(path: Path) -> pq.ParquetFile:
-    try:
-        return pq.ParquetFile(path, memory_map=True)
-    except (pa.ArrowException, OSError) as error:
-        raise InputError(f"{path}: expected a Parquet file, found something else ({error}); restore it") from error
+    with reading(path):
+        file = pq.ParquetFile(path, memory_map=True)
+        found = {field.name: field.type for field in file.schema_arrow}
+    for field in SCHEMA:
+        if found.get(field.name) != field.type:
+            raise InputError(
+                f"{path}: column {field.name!r} must be {field.type}, found {found.get(field.name, 'none')}; "
+                "it is no shard of a CarPatch3D store, or a damaged one"
+            )
+    return file
 
 
 def _counts(column: pa.ChunkedArray) -> dict[Any, int]:
@@ -267,7 +288,5 @@ def _counts(column: pa.ChunkedArray) -> dict[Any, int]:
 
 
 def _read_side_table(path: Path, columns: list[str] | None = None) -> pa.Table:
-    try:
+    with reading(path):
         return pq.read_table(path, columns=columns)
-    except (pa.ArrowException, OSError) as error:
-        raise InputError(f"{path}: expected a Parquet file, found something else ({error}); restore it") from error

@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 
 from carstudio.dataset.manifest import Manifest, Shard, read_manifest, write_manifest
 from carstudio.dataset.patch import PatchRecord
+from carstudio.dataset.reading import reading
 from carstudio.dataset.schema import PICTURES, SCHEMA, check_id, table_from_records
 from carstudio.errors import InputError
 from carstudio.files import atomic_path, is_partial, remove_partials, sha256_file
@@ -203,10 +204,12 @@ def describe_shard(path: Path) -> Shard:
 
 def count_patches(shard: Path) -> int:
     """Patches in a shard on disk, from its last bytes."""
-    num_rows: int = pq.read_metadata(shard).num_rows
-    return num_rows
+    with reading(shard):
+        num_rows: int = pq.read_metadata(shard).num_rows
+        return num_rows
 
 
 def _patch_ids(shard: Path) -> list[str]:
-    ids: list[str] = pq.read_table(shard, columns=["patch_id"])["patch_id"].to_pylist()
-    return ids
+    with reading(shard):
+        ids: list[str] = pq.read_table(shard, columns=["patch_id"])["patch_id"].to_pylist()
+        return ids

@@ -140,6 +140,8 @@ def _calibration(values: Sequence[float], name: str, key: str) -> KittiCalibrati
     if fx <= 0 or fy <= 0 or float(projection[2, 2]) <= 0:
         raise InputError(f"{name}: {key} must have positive focal lengths, found ({fx}, {fy}) px")
     x, y, z = camera_offset_from_projection(projection).tolist()
+    if not all(math.isfinite(value) for value in (x, y, z)):
+        raise InputError(f"{name}: {key} cannot be inverted (focal lengths {fx}, {fy} px); expected a camera's matrix")
     return KittiCalibration((fx, fy, cx, cy), (x, y, z))
 
 
