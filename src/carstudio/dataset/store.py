@@ -67,12 +67,16 @@ class PatchStore:
         return sum(file.metadata.num_rows for file in self._files)
 
     @cached_property
-    def _files(self) -> list[pq.ParquetFile]:
+    def _paths(self) -> list[Path]:
         paths = shard_paths(self.path)
         missing = {shard.name for shard in self.manifest.shards} - {path.name for path in paths}
         if missing:
             raise InputError(f"{self.path}: shards {sorted(missing)} are missing; restore them or rebuild the store")
-        return [_open_shard(path) for path in paths]
+        return paths
+
+    @cached_property
+    def _files(self) -> list[pq.ParquetFile]:
+        return [_open_shard(path) for path in self._paths]
 
     @cached_property
     def data_sha256(self) -> str:
@@ -96,7 +100,7 @@ class PatchStore:
     def _locations(self) -> dict[str, Location]:
         locations: dict[str, Location] = {}
         for shard, file in enumerate(self._files):
-            path = shard_paths(self.path)[shard]
+            path = self._paths[shard]
             with reading(path):
                 ids = _validated(file.read(columns=["patch_id"]))["patch_id"].to_pylist()
             counts = [file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)]
@@ -132,7 +136,7 @@ class PatchStore:
         return self._read_group(shard, group, LIGHT_COLUMNS)
 
     def _read_group(self, shard: int, group: int, columns: Iterable[str]) -> pa.Table:
-        with reading(shard_paths(self.path)[shard]):
+        with reading(self._paths[shard]):
             return _validated(self._files[shard].read_row_group(group, columns=list(columns), use_threads=False))
 
     def record(self, patch_id: str) -> PatchRecord:
@@ -148,14 +152,18 @@ class PatchStore:
 
     def light_records(self) -> Iterator[PatchRecord]:
         """All candidates in store order without their pictures (`image` is empty): for filters."""
-        for file in self._files:
-            yield from map(record_from_row, file.read(columns=list(LIGHT_COLUMNS)).to_pylist())
+        for path, file in zip(self._paths, self._files, strict=True):
+            with reading(path):
+                rows = file.read(columns=list(LIGHT_COLUMNS)).to_pylist()
+            yield from map(record_from_row, rows)
 
     def records(self) -> Iterator[PatchRecord]:
         """All candidates in store order, kept or not, with their pictures; one row group is in memory at a time."""
-        for file in self._files:
+        for path, file in zip(self._paths, self._files, strict=True):
             for group in range(file.num_row_groups):
-                yield from map(record_from_row, file.read_row_group(group, use_threads=False).to_pylist())
+                with reading(path):
+                    rows = file.read_row_group(group, use_threads=False).to_pylist()
+                yield from map(record_from_row, rows)
 
     def patch(self, patch_id: str) -> Patch:
         """One patch decoded."""
