@@ -16,6 +16,7 @@ from carstudio.errors import InputError
 from carstudio.files import write_bytes
 
 MAX_IMAGE_PIXELS = 120_000_000  # 12,000 x 10,000: larger than any camera's photo, small enough for a laptop's memory
+FORMATS = ("PNG", "JPEG", "GIF", "BMP", "TIFF", "WEBP", "PPM")  # no other: Pillow starts Ghostscript for EPS
 DEPTH_STEPS_PER_METRE = 256.0  # KITTI's depth PNG
 # What Pillow raises on damaged files, as fuzzing found.
 BROKEN = (OSError, ValueError, SyntaxError, EOFError, TypeError, KeyError, IndexError, OverflowError, struct.error)
@@ -54,7 +55,7 @@ def _open(data: bytes, name: str) -> Image.Image:
     try:
         with warnings.catch_warnings():  # our own bound follows
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            image = Image.open(io.BytesIO(data))
+            image = Image.open(io.BytesIO(data), formats=FORMATS)
     except BROKEN as error:
         raise InputError(f"{name}: expected an image (PNG, JPEG, ...), found something else ({error})") from error
     except Image.DecompressionBombError as error:
