@@ -148,3 +148,11 @@ def test_a_decompression_bomb_costs_no_memory(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"bomb\.png"):
         read_image(tmp_path / "bomb.png")
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100 * 1024
+
+
+def test_formats_that_start_programs_are_refused(tmp_path: Path) -> None:
+    """Pillow hands EPS to Ghostscript, which runs what the file says."""
+    eps = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n%%EndComments\nshowpage\n%%EOF\n"
+    (tmp_path / "photo.eps").write_bytes(eps)
+    with pytest.raises(InputError, match=r"photo\.eps: expected an image"):
+        read_image(tmp_path / "photo.eps")

@@ -99,14 +99,23 @@ def write_json(path: Path | str, value: Any) -> None:
 
 
 def read_json(path: Path | str) -> Any:
-    """Read a JSON file; `InputError` names the file and the line when it is missing or not JSON."""
+    """Read a JSON file; `InputError` names the file and the place when it is missing or not JSON."""
     path = Path(path)
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return parse_json(path.read_bytes(), name=str(path))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); expected a JSON file") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected JSON, found something else ({error})") from error
+
+
+def parse_json(text: str | bytes, *, name: str) -> Any:
+    """A JSON value; `InputError` for anything else, nesting and numbers that no file of ours has included."""
+    try:
+        return json.loads(text)
+    except ValueError as error:  # JSONDecodeError, UnicodeDecodeError, and Python's limit on the digits of a number
+        shown = text[:60] if isinstance(text, str) else text[:60].decode("utf-8", errors="replace")
+        raise InputError(f"{name}: expected JSON, found {shown!r} ({error})") from error
+    except RecursionError as error:
+        raise InputError(f"{name}: expected JSON, found one value in another, hundreds deep") from error
 
 
 def sha256_file(path: Path | str) -> str:

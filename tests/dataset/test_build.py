@@ -149,8 +149,8 @@ def test_finished_is_said_last(root: Path, tmp_path: Path, step: str, monkeypatc
 
 def test_refilter_looks_only_at_stored_values(root: Path, tmp_path: Path) -> None:
     store = build_small(root, tmp_path / "s")
-    strict = judge_store(store, FilterRecipe(depth_m=5.5, height_px=1.0, width_px=1.0, mask_ratio=0.0, box_iou=0.0))
-    assert [verdict.reason for verdict in strict] == ["depth_m", "depth_m", "kept"]
+    judge_store(store, FilterRecipe(depth_m=5.5, height_px=1.0, width_px=1.0, mask_ratio=0.0, box_iou=0.0))
+    assert [verdict.reason for verdict in store.verdicts()] == ["depth_m", "depth_m", "kept"]
     assert open_store(tmp_path / "s").patch_ids() == ["km-0000-000001-007"]
 
 

@@ -302,7 +302,7 @@ def test_open_store_explains_what_it_cannot_open(tmp_path: Path) -> None:
         open_store(tmp_path / "s")
     manifest.write_text(json.dumps(content))
     (tmp_path / "s" / "data" / "part-00000.parquet").write_bytes(b"no parquet")
-    with pytest.raises(InputError, match="expected a Parquet file"):
+    with pytest.raises(InputError, match="expected a whole Parquet file"):
         len(open_store(tmp_path / "s"))
     (tmp_path / "s" / "data" / "part-00000.parquet").unlink()
     with pytest.raises(InputError, match="are missing"):

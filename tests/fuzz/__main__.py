@@ -1,10 +1,12 @@
-"""`./run fuzz`: damaged labels, images, stores and checkpoints by the thousand; each must be read or refused in words."""
+"""`./run fuzz`: damaged labels, images, stores, checkpoints by the thousand; each must be read or refused in words."""
 
 import argparse
 import logging
 import resource
 import sys
 import time
+import warnings
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -27,13 +29,14 @@ def main(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     logging.disable(logging.WARNING)
+    warnings.simplefilter("ignore", UserWarning)  # Pillow's on damaged EXIF
     console, found = Console(), False
     table = Table("target", "inputs", "read", "refused", "faults", "seconds", "slowest (s)")
     for name in TARGETS if options.target == "all" else [options.target]:
         started = time.monotonic()
         with Progress(*Progress.get_default_columns(), MofNCompleteColumn(), console=console, transient=True) as bar:
             task = bar.add_task(name, total=options.inputs)
-            outcome = fuzz(TARGETS[name], options.inputs, options.seed, lambda: bar.advance(task))
+            outcome = fuzz(TARGETS[name], options.inputs, options.seed, partial(bar.advance, task))
         seconds = time.monotonic() - started
         row = (outcome.inputs, outcome.accepted, outcome.refused, len(outcome.crashes))
         table.add_row(name, *(f"{value:,}" for value in row), f"{seconds:.0f}", f"{outcome.slowest_s:.2f}")

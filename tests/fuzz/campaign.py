@@ -62,8 +62,7 @@ def _one(target: Target, data: bytes, folder: Path, outcome: Outcome) -> None:
         with time_limit(SECONDS_PER_INPUT):
             target.read(data, folder)
         outcome.accepted += 1
-    except InputError as error:
-        assert str(error).strip(), "an error must say something"
+    except InputError:
         outcome.refused += 1
     except BaseException as error:
         if isinstance(error, KeyboardInterrupt | SystemExit):

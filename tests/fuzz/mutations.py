@@ -8,8 +8,8 @@ import re
 from collections.abc import Callable
 
 NUMBERS = (
-    b"nan", b"-inf", b"Infinity", b"1e308", b"-1e308", b"1e-320", b"-0.0", b"0", b"-1", b"2147483648", b"18446744073709551616",
-    b"9" * 400, b"1e999", b"0x10", b"1_000", b"",
+    b"nan", b"-inf", b"Infinity", b"1e308", b"-1e308", b"1e-320", b"-0.0", b"0", b"-1", b"2147483648",
+    b"18446744073709551616", b"9" * 400, b"1e999", b"0x10", b"1_000", b"",
 )  # fmt: skip
 WORDS = (
     b"null", b"true", b"[]", b"{}", b'""', b'"../../../etc/passwd"', b'"/etc/passwd"', b'"\\u0000"', b'"<script>"',

@@ -1,55 +1,72 @@
-"""Turbo and depth colours against OpenCV's tables of the same maps and the published ends."""
-
 import cv2
+import matplotlib
 import numpy as np
 import pytest
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 
 from carstudio.report.colours import NO_DEPTH, colour_depth, turbo
 
-RAMP = np.linspace(0.0, 1.0, 256, dtype=np.float32)[None]
+RAMP = np.linspace(0, 1, 256, dtype=np.float32).reshape(16, 16)
 
 
-def by_opencv(kind: int) -> np.ndarray:
-    """Row of 256 colours, RGB."""
-    return cv2.applyColorMap(np.arange(256, dtype=np.uint8)[None], kind)[0, :, ::-1].astype(int)
+def by_matplotlib(values: np.ndarray, name: str, low: float, high: float) -> np.ndarray:
+    """Its own way from numbers to bytes."""
+    return ScalarMappable(Normalize(low, high, clip=True), name).to_rgba(values, bytes=True)[..., :3]
 
 
-def test_turbo_is_opencvs_turbo() -> None:
-    assert np.abs(turbo(RAMP)[0].astype(int) - by_opencv(cv2.COLORMAP_TURBO)).max() <= 2  # rounding of the tables
+def test_turbo_is_matplotlibs_and_opencvs() -> None:
+    colours = turbo(RAMP).astype(int)
+    assert np.abs(colours - by_matplotlib(RAMP, "turbo", 0, 1)).max() <= 1  # to_rgba cuts where we round
+    indices = np.round(RAMP * 255).astype(np.uint8)
+    opencvs = cv2.applyColorMap(indices, cv2.COLORMAP_TURBO)[..., ::-1].astype(int)
+    assert np.abs(colours - opencvs).max() <= 2
 
 
-def test_turbo_clips_and_shows_nan_as_nothing() -> None:
-    picture = turbo(np.array([[-3.0, 0.0, np.nan, 1.0, 7.0]], np.float32))[0]
-    assert (picture[:3] == picture[0]).all()
-    assert (picture[3:] == picture[3]).all()
-    assert tuple(picture[0]) == (48, 18, 59)  # the two ends as published
-    assert tuple(picture[3]) == (122, 4, 3)
+def test_turbo_clips_and_takes_nan_for_nothing() -> None:
+    values = np.array([[-1.0, 0.0, np.nan, 1.0, 7.0, np.inf]], np.float32)
+    colours = turbo(values)[0]
+    assert (colours[[1, 2]] == colours[0]).all()
+    assert (colours[[4, 5]] == colours[3]).all()
 
 
-def test_depth_is_opencvs_viridis_from_near_to_far() -> None:
-    depth = 5.0 + 10.0 * RAMP[:, ::-1]  # far first, so that the row runs from dark to bright
-    picture = colour_depth(depth, near_m=5.0, far_m=15.0)[0].astype(int)
-    assert np.abs(picture - by_opencv(cv2.COLORMAP_VIRIDIS)).max() <= 2
+def test_depth_is_viridis_from_far_to_near() -> None:
+    depth = (5 + 10 * RAMP).astype(np.float32)
+    colours = colour_depth(depth, near_m=5.0, far_m=15.0).astype(int)
+    expected = by_matplotlib(-depth, "viridis", -15, -5).astype(int)
+    assert np.abs(colours - expected).max() <= 2  # one table entry where rounding falls the other way
+    assert (np.diff(colours.reshape(-1, 3)[:, 1]) <= 0).all()  # green falls all the way: no colour means two depths
 
 
-def test_depth_takes_its_range_from_the_picture() -> None:
-    """2nd and 98th percentile: one wild value changes the ends by little, and is drawn like the end."""
-    depth = np.linspace(8.0, 12.0, 1000, dtype=np.float32).reshape(20, 50)
+def test_depth_beyond_its_range_has_the_ends_colours() -> None:
+    colours = colour_depth(np.array([[1.0, 5.0, 10.0, 99.0]], np.float32), near_m=5.0, far_m=10.0)[0]
+    yellow, violet = (np.round(255 * np.array(matplotlib.colormaps["viridis"](end)[:3])) for end in (1.0, 0.0))
+    assert (colours[:2] == yellow).all()
+    assert (colours[2:] == violet).all()
+
+
+def test_without_a_range_the_outermost_fiftieths_do_not_count() -> None:
+    """One wild pixel in a thousand does not swallow the contrast of the others."""
+    depth = np.linspace(10, 20, 1000, dtype=np.float32).reshape(25, 40)
+    plain = colour_depth(depth)
     wild = depth.copy()
-    wild[-1, -1] = 500.0
-    plain, with_wild = colour_depth(depth).astype(int), colour_depth(wild).astype(int)
-    assert np.abs(plain - with_wild).max() <= 3
-    assert (colour_depth(depth)[0, :5] == colour_depth(depth)[0, 0]).all()  # below the 2nd percentile: all nearest
+    wild[0, 0], wild[24, 39] = 0.5, 500.0
+    assert np.abs(colour_depth(wild).astype(int)[1:24] - plain.astype(int)[1:24]).max() <= 4
+    low, high = np.sort(depth.ravel())[[20, 979]]  # ranks of 2 % and 98 %
+    close = colour_depth(depth, near_m=float(low), far_m=float(high)).astype(int)
+    assert np.abs(close - plain).max() <= 4
 
 
 @pytest.mark.parametrize("nothing", [np.nan, 0.0, -1.0, np.inf])
-def test_no_depth_is_almost_black(nothing: float) -> None:
-    depth = np.array([[nothing, 9.0], [9.0, 9.0]], np.float32)
-    picture = colour_depth(depth)
-    assert tuple(picture[0, 0]) == NO_DEPTH
-    assert picture[0, 1].max() > 2 * max(NO_DEPTH)
-    assert (colour_depth(np.full((2, 3), nothing, np.float32)) == NO_DEPTH).all()
+def test_pixels_without_depth_are_almost_black(nothing: float) -> None:
+    depth = np.array([[nothing, 5.0], [6.0, nothing]], np.float32)
+    colours = colour_depth(depth)
+    assert (colours[[0, 1], [0, 1]] == NO_DEPTH).all()
+    assert (colours[[0, 1], [1, 0]] != NO_DEPTH).any(axis=-1).all()
+    assert (colour_depth(np.full((2, 2), nothing, np.float32)) == NO_DEPTH).all()
 
 
-def test_one_depth_all_over_is_no_division_by_zero() -> None:
-    assert np.unique(colour_depth(np.full((4, 4), 7.0, np.float32)).reshape(-1, 3), axis=0).shape == (1, 3)
+def test_a_flat_depth_is_no_division_by_zero() -> None:
+    with np.errstate(all="raise"):
+        colours = colour_depth(np.full((2, 3), 7.0, np.float32))
+    assert (colours == colours[0, 0]).all()

@@ -1,6 +1,7 @@
 """A store's `manifest.json`: format version, counts, checksums; nothing about when or where it was made."""
 
 import hashlib
+import re
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from carstudio.files import read_json, write_json
 
 FORMAT = "carpatch3d"
 FORMAT_VERSION = 1
+_SHARD_NAME = re.compile(r"[\w.-]+")
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ def read_manifest(folder: Path) -> Manifest:
         )
     try:
         return _manifest_from_json(content)
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: broken manifest ({error!r}); rebuild the store or restore the file") from error
 
 
@@ -89,10 +91,19 @@ def is_finished_store(folder: Path) -> bool:
         return False
 
 
+def _shard_from_json(value: dict[str, Any]) -> Shard:
+    name, count, checksum = value.get("name"), value.get("num_patches"), value.get("sha256")
+    if not (isinstance(name, str) and _SHARD_NAME.fullmatch(name) and isinstance(checksum, str)):
+        raise TypeError(f"shard {value!r}: expected the name of a file in data/ and its sha256")
+    if isinstance(count, bool) or not isinstance(count, int) or count < 0:
+        raise TypeError(f"shard {name}: num_patches must be 0 or more, found {count!r}")
+    return Shard(**value)
+
+
 def _manifest_from_json(content: dict[str, Any]) -> Manifest:
     return Manifest(
-        sources=tuple(content["sources"]),
-        shards=tuple(Shard(**shard) for shard in content["shards"]),
+        sources=tuple(str(source) for source in content["sources"]),
+        shards=tuple(_shard_from_json(shard) for shard in content["shards"]),
         is_finished=bool(content["is_finished"]),
         resume_key=content.get("resume_key"),
         format_version=content["format_version"],

@@ -9,10 +9,11 @@ import os
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from itertools import islice
 from multiprocessing import connection, resource_tracker
 from typing import TypeVar
 
@@ -27,20 +28,21 @@ Result = TypeVar("Result")
 
 
 def ordered_map(
-    work: Callable[[Item], Result], items: Sequence[Item], *, workers: int, chunk: int = 1
+    work: Callable[[Item], Result], items: Iterable[Item], *, workers: int, chunk: int = 1
 ) -> Generator[Result, None, None]:
     """`map(work, items)` on several processes, `chunk` items at a time; both `work` and its results get pickled.
 
+    Items are taken as they are needed: they need not all be in memory.
     With one worker all is done in this process. Close the iterator (`contextlib.closing`) to end the workers at once.
     """
     if workers <= 1:
         yield from map(work, items)
         return
-    chunks = [items[i : i + chunk] for i in range(0, len(items), chunk)]
+    left = iter(items)
     try:
         with _pool(workers) as pool:
             waiting: deque[Future[list[Result]]] = deque()
-            for some in chunks:
+            while some := list(islice(left, chunk)):
                 waiting.append(_submit(pool, work, some))
                 if len(waiting) > 2 * workers:  # keeps memory bounded
                     yield from waiting.popleft().result()

@@ -91,8 +91,7 @@ def synthesize(config: SynthConfig, report: Report = silent) -> BuildSummary:
     _check(config)
     if is_made_already(config.out, asdict(config)):
         clear_leftovers(config.out)
-        store = open_store(config.out)
-        return summarize(store, source=SOURCE, verdicts=store.verdicts())
+        return summarize(open_store(config.out), source=SOURCE)
     files = mesh_files(config.meshes)
     with StoreWriter(config.out, source=SOURCE, resume_key=_resume_key(config, files)) as writer:
         write_run(config.out, asdict(config))
@@ -104,8 +103,8 @@ def synthesize(config: SynthConfig, report: Report = silent) -> BuildSummary:
                     if not writer.has(record.patch_id):
                         writer.append(record)
                 report("photograph", done, config.cars, f"{len(writer)} photos")
-        verdicts = judge_and_split(writer, KEEP_ALL)
-    summary = summarize(open_store(config.out), source=SOURCE, verdicts=verdicts)
+        judge_and_split(writer, KEEP_ALL)
+    summary = summarize(open_store(config.out), source=SOURCE)
     return replace(summary, seconds=time.perf_counter() - start)
 
 
