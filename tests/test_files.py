@@ -17,6 +17,7 @@ from carstudio.files import (
     atomic_path,
     inside,
     is_partial,
+    parse_json,
     read_json,
     remove_partials,
     require_writable,
@@ -179,3 +180,9 @@ def test_a_sibling_with_the_same_beginning_is_outside(tmp_path):
     (tmp_path / "store").mkdir()
     with pytest.raises(InputError, match="leaves its folder"):
         inside(tmp_path / "store", "../store-other/a.png")
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000, "9" * 10_000, b"\xff\xfe\x00", "{'a': 1}"])
+def test_json_that_no_file_of_ours_holds_is_the_users_error(text, tmp_path):
+    with pytest.raises(InputError, match="here: expected JSON, found"):
+        parse_json(text, name="here")

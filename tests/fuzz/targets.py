@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from carstudio.dataset.legacy_json.importer import LegacyJob, open_legacy
 from carstudio.dataset.manifest import read_manifest
 from carstudio.dataset.sources.kitti_format import (
     center_in_camera,
@@ -21,6 +22,7 @@ from carstudio.dataset.sources.kitti_format import (
     parse_labels,
 )
 from carstudio.dataset.store import open_store
+from carstudio.dataset.verify import record_problems
 from carstudio.errors import InputError
 from carstudio.evaluation.results import read_rows
 from carstudio.files import read_json
@@ -29,6 +31,7 @@ from carstudio.models.zoo import build_model
 from carstudio.training.checkpoint import describe_model, load_model, save_model
 from carstudio.training.log import read_log
 from carstudio.training.resume import STATE, TrainingState, load_state, save_state
+from dataset.authors_files import write_subset
 from training.toy import TINY, toy_store
 
 LABELS = b"""Car 0.00 0 -1.57 599.41 156.40 629.75 189.25 2.85 2.63 12.34 0.47 1.49 69.44 -1.56
@@ -250,6 +253,25 @@ def read_any_json(data: bytes, folder: Path) -> None:
     read_json(folder / "f.json")
 
 
+def legacy_seeds(folder: Path) -> list[bytes]:
+    """The authors' json of two subsets."""
+    return [write_subset(folder / subset, subset).read_bytes() for subset in ("km", "ko")]
+
+
+def read_legacy(data: bytes, folder: Path) -> None:
+    """Records of a damaged json, its pictures sound: a patch, or the problem with it in words."""
+    if not (folder / "patch").exists():
+        for subset in ("km", "ko"):
+            write_subset(folder, subset)
+    (folder / "km.json").write_bytes(data)
+    source = open_legacy(folder / "km.json")
+    job = LegacyJob(source.folder, "exact")
+    for result in map(job, source.items(frozenset())):
+        assert bool(result.records) != bool(result.problems), result
+        for record in result.records:
+            assert not [problem for problem in record_problems(record) if "focal" in problem or "finite" in problem]
+
+
 ROW = {
     **{name: "a" for name in ("method", "protocol", "split", "instance_id", "patch_id", "input_patch_id")},
     **{"psnr": 20.5, "psnr_mask": 19.0, "ssim": 0.5, "ssim_mask": 0.4, "lpips": None, "mask_iou": 0.9},
@@ -271,6 +293,7 @@ TARGETS = {
     "rows": Target(lambda folder: [json.dumps(ROW).encode() + b"\n"], read_result_rows),
     "log": Target(lambda folder: [LOG], read_training_log),
     "json": Target(manifest_seeds, read_any_json),
+    "legacy": Target(legacy_seeds, read_legacy),
 }
 
 warnings.simplefilter("error", RuntimeWarning)

@@ -79,7 +79,7 @@ def read_manifest(folder: Path) -> Manifest:
         )
     try:
         return _manifest_from_json(content)
-    except (KeyError, TypeError) as error:
+    except (KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: broken manifest ({error!r}); rebuild the store or restore the file") from error
 
 
@@ -92,12 +92,12 @@ def is_finished_store(folder: Path) -> bool:
 
 
 def _shard_from_json(value: dict[str, Any]) -> Shard:
-    shard = Shard(**value)
-    if not (isinstance(shard.name, str) and _SHARD_NAME.fullmatch(shard.name) and isinstance(shard.sha256, str)):
+    name, count, checksum = value.get("name"), value.get("num_patches"), value.get("sha256")
+    if not (isinstance(name, str) and _SHARD_NAME.fullmatch(name) and isinstance(checksum, str)):
         raise TypeError(f"shard {value!r}: expected the name of a file in data/ and its sha256")
-    if isinstance(shard.num_patches, bool) or not isinstance(shard.num_patches, int) or shard.num_patches < 0:
-        raise TypeError(f"shard {shard.name}: num_patches must be 0 or more, found {shard.num_patches!r}")
-    return shard
+    if isinstance(count, bool) or not isinstance(count, int) or count < 0:
+        raise TypeError(f"shard {name}: num_patches must be 0 or more, found {count!r}")
+    return Shard(**value)
 
 
 def _manifest_from_json(content: dict[str, Any]) -> Manifest:

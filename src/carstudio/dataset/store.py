@@ -94,14 +94,18 @@ class PatchStore:
         if not self._files:
             return SCHEMA.empty_table().select(columns)
         with reading(self.path / "data"):
-            return pa.concat_tables([file.read(columns=columns) for file in self._files])
+            return _validated(pa.concat_tables([file.read(columns=columns) for file in self._files]))
 
     @cached_property
     def _locations(self) -> dict[str, Location]:
         locations: dict[str, Location] = {}
         for shard, file in enumerate(self._files):
-            with reading(self._paths[shard]):
-                ids = file.read(columns=["patch_id"])["patch_id"].to_pylist()
+            path = self._paths[shard]
+            with reading(path):
+                ids = _validated(file.read(columns=["patch_id"]))["patch_id"].to_pylist()
+            counts = [file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)]
+            if sum(counts) != len(ids):
+                raise InputError(f"{path}: its row groups tell of {sum(counts)} patches, found {len(ids)}; restore it")
             start = 0
             for group in range(file.num_row_groups):
                 stop = start + file.metadata.row_group(group).num_rows
@@ -133,7 +137,7 @@ class PatchStore:
 
     def _read_group(self, shard: int, group: int, columns: Iterable[str]) -> pa.Table:
         with reading(self._paths[shard]):
-            return self._files[shard].read_row_group(group, columns=list(columns), use_threads=False)
+            return _validated(self._files[shard].read_row_group(group, columns=list(columns), use_threads=False))
 
     def record(self, patch_id: str) -> PatchRecord:
         """One patch as stored."""
@@ -150,7 +154,7 @@ class PatchStore:
         """All candidates in store order without their pictures (`image` is empty): for filters."""
         for path, file in zip(self._paths, self._files, strict=True):
             with reading(path):
-                rows = file.read(columns=list(LIGHT_COLUMNS)).to_pylist()
+                rows = _validated(file.read(columns=list(LIGHT_COLUMNS))).to_pylist()
             yield from map(record_from_row, rows)
 
     def records(self) -> Iterator[PatchRecord]:
@@ -158,7 +162,7 @@ class PatchStore:
         for path, file in zip(self._paths, self._files, strict=True):
             for group in range(file.num_row_groups):
                 with reading(path):
-                    rows = file.read_row_group(group, use_threads=False).to_pylist()
+                    rows = _validated(file.read_row_group(group, use_threads=False)).to_pylist()
                 yield from map(record_from_row, rows)
 
     def patch(self, patch_id: str) -> Patch:
@@ -267,6 +271,12 @@ class PatchStore:
 _SPLIT_SCHEMA = pa.schema(
     [pa.field("patch_id", pa.string(), nullable=False), pa.field("part", pa.string(), nullable=False)]
 )
+
+
+def _validated(table: pa.Table) -> pa.Table:
+    """The table, its text checked to be UTF-8 and its offsets to lie in its buffers (ArrowInvalid otherwise)."""
+    table.validate(full=True)
+    return table
 
 
 def _open_shard(path: Path) -> pq.ParquetFile:
