@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from carstudio.cli import run
 from carstudio.commands.dataset import refilter
 from carstudio.dataset.build import BuildConfig, build
 from carstudio.dataset.filters import FilterRecipe
@@ -21,6 +22,7 @@ from carstudio.dataset.sources.synthetic import SynthConfig, synthesize
 from carstudio.dataset.store import PatchStore, StoreWriter, open_store
 from carstudio.dataset.verdicts import Verdict
 from carstudio.errors import InputError
+from carstudio.files import is_partial
 from carstudio.images import encode_jpeg, encode_png
 from dataset.authors_files import DATASET_NAMES, write_all, write_subset
 from oracles import released_formulas
@@ -351,6 +353,9 @@ def test_an_interrupted_export_is_finished_by_the_same_command(authors: Path, im
     with pytest.raises(KeyboardInterrupt):
         export_legacy(open_store(imported), tmp_path / "out", report=interrupt)
     assert not list((tmp_path / "out").glob("*.json"))
+    killed = tmp_path / "out" / ".km-abcdefgh.partial.json"  # a kill leaves this: nobody tidies up
+    assert is_partial(killed)
+    killed.write_text("{")
     export_legacy(open_store(imported), tmp_path / "out")
     assert tree(tmp_path / "out") == tree(authors)
 
@@ -373,3 +378,30 @@ def test_refilter_judges_and_splits_again(imported: Path, authors: Path, tmp_pat
     assert outcome.value["reasons"] == {"kept": len(kept), "height_px": 4 - len(kept)}
     assert sum(outcome.value["splits"]["released-patch"].values()) == len(kept)
     assert open_store(store.path).verify() == []
+
+
+def test_the_command_line_from_their_files_and_back(
+    authors: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store, out = str(tmp_path / "store"), str(tmp_path / "out")
+    assert (
+        run(["build", "legacy-json", "--root", str(authors), "--subset", "km", "--out", store, "--workers", "1"]) == 0
+    )
+    assert "4 candidates" in capsys.readouterr().out
+    assert (
+        run(["dataset", "refilter", store, "--height-px", "36", "--mask-ratio", "0", "--box-iou", "0", "--json"]) == 0
+    )
+    kept = json.loads(capsys.readouterr().out)["reasons"]["kept"]
+    assert 0 < kept < 4
+    assert run(["dataset", "export", store, "--format", "legacy-json", "--out", out, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"out": out, "files": {"km.json": kept}, "left_out": {}}
+    assert run(["dataset", "export", store, "--patches", "all", "--out", str(tmp_path / "all")]) == 0
+    assert (tmp_path / "all" / "km.json").read_bytes() == (authors / "km.json").read_bytes()
+    for arguments, message in (
+        (["export", store], "export needs --out FOLDER"),
+        (["info", store, "--out", out], "--out and --patches are for export, not for info"),
+        (["export", store, "--out", out, "--depth-m", "40"], "thresholds are for refilter, not for export"),
+        (["export", store, "--out", out], "holds other files"),
+    ):
+        assert run(["dataset", *arguments]) == 2
+        assert message in capsys.readouterr().err

@@ -237,6 +237,13 @@ def test_workers_and_an_interruption_change_no_byte(tmp_path: Path, monkeypatch:
     build(replace(config, workers=2))
     assert tree(tmp_path / "again") == tree(tmp_path / "whole")
 
+    with pytest.raises(KeyboardInterrupt):
+        build(replace(config, out=tmp_path / "other"), interrupt)
+    text = root.read_text()
+    root.write_text(text.replace("-1.57", "-1.56"))  # another json: nothing of the first may stay
+    build(replace(config, out=tmp_path / "other"))
+    assert set(open_store(tmp_path / "other").table(["box_yaw"])["box_yaw"].to_pylist()) == {-1.56}
+
 
 NAMES = [
     ("km", "patch/km_0100097004_patch.png", "km-0001-000097-004", "km-0001-004"),

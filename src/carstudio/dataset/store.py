@@ -154,7 +154,7 @@ class PatchStore:
         """All candidates in store order without their pictures (`image` is empty): for filters."""
         for path, file in zip(self._paths, self._files, strict=True):
             with reading(path):
-                rows = file.read(columns=list(LIGHT_COLUMNS)).to_pylist()
+                rows = _validated(file.read(columns=list(LIGHT_COLUMNS))).to_pylist()
             yield from map(record_from_row, rows)
 
     def records(self) -> Iterator[PatchRecord]:
@@ -162,7 +162,7 @@ class PatchStore:
         for path, file in zip(self._paths, self._files, strict=True):
             for group in range(file.num_row_groups):
                 with reading(path):
-                    rows = file.read_row_group(group, use_threads=False).to_pylist()
+                    rows = _validated(file.read_row_group(group, use_threads=False)).to_pylist()
                 yield from map(record_from_row, rows)
 
     def patch(self, patch_id: str) -> Patch:
