@@ -4,6 +4,7 @@ Arrays are numpy, (height, width[, channels]). Depth images follow KITTI: value 
 """
 
 import io
+import os
 import struct
 import warnings
 from pathlib import Path
@@ -17,6 +18,7 @@ from carstudio.errors import InputError
 from carstudio.files import write_bytes
 
 MAX_IMAGE_PIXELS = 120_000_000  # 12,000 x 10,000: larger than any camera's photo, small enough for a laptop's memory
+MAX_IMAGE_BYTES = 2**30  # uncompressed 16-bit colour of that many pixels is 0.7 GB
 FORMATS = ("PNG", "JPEG", "GIF", "BMP", "TIFF", "WEBP", "PPM")  # all else is refused: Pillow starts Ghostscript for EPS
 DEPTH_STEPS_PER_METRE = 256.0  # KITTI's depth PNG
 # What Pillow raises on damaged files, as fuzzing found.
@@ -111,12 +113,20 @@ def image_size(data: bytes, *, name: str) -> tuple[int, int]:
 
 def read_image(path: Path | str, *, mode: str = "RGB") -> UInt8[np.ndarray, "height width *channels"]:
     """`decode_image` of a file."""
-    path = Path(path)
+    return decode_image(read_encoded(path), name=str(path), mode=mode)
+
+
+def read_encoded(path: Path | str) -> bytes:
+    """The bytes of an image file as they are; `InputError` when they cannot be read or are absurdly many."""
     try:
-        data = path.read_bytes()
+        with Path(path).open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            data = file.read() if size <= MAX_IMAGE_BYTES else b""
     except OSError as error:
         raise InputError(f"{path}: image cannot be read ({error.strerror}); replace or remove it") from error
-    return decode_image(data, name=str(path), mode=mode)
+    if size > MAX_IMAGE_BYTES:
+        raise InputError(f"{path}: expected an image of at most {MAX_IMAGE_BYTES:,} bytes, found {size:,}; scale it")
+    return data
 
 
 def encode_png(pixels: Shaped[np.ndarray, "height width *channels"]) -> bytes:
