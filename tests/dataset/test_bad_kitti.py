@@ -214,7 +214,7 @@ def test_a_folder_full_of_bad_files_is_built_and_every_problem_told(
     folder = root / "training" / "image_02" / "0000"
     said = bad_photos(folder, 5)
     odd = odd_photos(folder, 14)
-    command = ["build", "kitti-mot", "--root", str(root), "--out", str(tmp_path / "s"), "--workers", "2", "--json"]
+    command = ["build", "kitti-mot", "--root", str(root), "--out", str(tmp_path / "s"), "--workers", "1", "--json"]
     assert run(command) == 0
     summary = json.loads(capsys.readouterr().out)
     problems = {problem.split()[1]: problem for problem in summary["problems"]}
