@@ -7,11 +7,13 @@ import io
 import os
 import struct
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
-from PIL import Image
+from PIL import EpsImagePlugin, Image
 from PIL.TiffImagePlugin import TiffImageFile
 
 from carstudio.errors import InputError
@@ -102,6 +104,16 @@ def _upright_turn(image: Image.Image) -> Image.Transpose | None:
         return TURNS.get(image.getexif().get(0x0112, 1))
     except BROKEN:
         return None
+
+
+@contextmanager
+def no_ghostscript() -> Iterator[None]:
+    """Pillow starts no program in this block, whatever images a library opens there by itself."""
+    before, EpsImagePlugin.gs_binary = EpsImagePlugin.gs_binary, False
+    try:
+        yield
+    finally:
+        EpsImagePlugin.gs_binary = before
 
 
 def image_size(data: bytes, *, name: str) -> tuple[int, int]:
