@@ -4,19 +4,24 @@ Arrays are numpy, (height, width[, channels]). Depth images follow KITTI: value 
 """
 
 import io
+import os
 import struct
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
-from PIL import Image
+from PIL import EpsImagePlugin, Image
+from PIL.TiffImagePlugin import TiffImageFile
 
 from carstudio.errors import InputError
 from carstudio.files import write_bytes
 
 MAX_IMAGE_PIXELS = 120_000_000  # 12,000 x 10,000: larger than any camera's photo, small enough for a laptop's memory
-FORMATS = ("PNG", "JPEG", "GIF", "BMP", "TIFF", "WEBP", "PPM")  # no other: Pillow starts Ghostscript for EPS
+MAX_IMAGE_BYTES = 2**30  # uncompressed 16-bit colour of that many pixels is 0.7 GB
+FORMATS = ("PNG", "JPEG", "GIF", "BMP", "TIFF", "WEBP", "PPM")  # all else is refused: Pillow starts Ghostscript for EPS
 DEPTH_STEPS_PER_METRE = 256.0  # KITTI's depth PNG
 # What Pillow raises on damaged files, as fuzzing found.
 BROKEN = (OSError, ValueError, SyntaxError, EOFError, TypeError, KeyError, IndexError, OverflowError, struct.error)
@@ -33,20 +38,41 @@ SIDEWAYS = {TURNS[orientation] for orientation in (5, 6, 7, 8)}
 
 
 def decode_image(data: bytes, *, name: str, mode: str = "RGB") -> UInt8[np.ndarray, "height width *channels"]:
-    """Pixels of an encoded image as `mode` ("RGB" or "L"), EXIF orientation applied once.
+    """Pixels of an encoded image as `mode` ("RGB" or "L"), EXIF orientation applied once; of an animation the first.
 
     Raises `InputError` naming `name` when the bytes are not a whole image or exceed `MAX_IMAGE_PIXELS`.
     """
-    image = _open(data, name)
-    turn = _upright_turn(image)
+    image = _load(data, name)
+    if image.mode == "F":
+        raise InputError(f"{name}: expected 8 or 16 bits per channel, found floating-point values; convert the file")
     try:
+        turn = _upright_turn(image)
         if turn is not None:
             image = image.transpose(turn)
         if mode == "RGB" and image.mode in ("I;16", "I;16B", "I"):
-            image = Image.fromarray((np.asarray(image).astype(np.uint32) >> 8).clip(0, 255).astype(np.uint8))
-        return np.array(image.convert(mode))
+            image = Image.fromarray((np.asarray(image) >> 8).clip(0, 255).astype(np.uint8))
+        image.info.pop("transparency", None)  # the pixels below count, whatever is see-through
+        return np.array(image if image.mode == mode else image.convert(mode))
     except BROKEN as error:
-        raise InputError(f"{name}: image is broken or truncated ({error}); replace or remove the file") from error
+        raise _broken(name, error) from error
+
+
+def _load(data: bytes, name: str) -> Image.Image:
+    """The image with its pixels. A TIFF turns itself upright while it is loaded and forgets its orientation."""
+    image = _open(data, name)
+    try:
+        if image.format == "PNG":
+            _open(data, name).verify()  # checksums of the chunks, which loading the pixels does not look at
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            image.load()
+    except BROKEN as error:
+        raise _broken(name, error) from error
+    return image
+
+
+def _broken(name: str, error: Exception) -> InputError:
+    return InputError(f"{name}: image is broken or truncated ({error}); replace or remove the file")
 
 
 def _open(data: bytes, name: str) -> Image.Image:
@@ -57,12 +83,17 @@ def _open(data: bytes, name: str) -> Image.Image:
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             image = Image.open(io.BytesIO(data), formats=FORMATS)
     except BROKEN as error:
-        raise InputError(f"{name}: expected an image (PNG, JPEG, ...), found something else ({error})") from error
+        raise InputError(
+            f"{name}: expected an image ({', '.join(FORMATS)}), found something else or a broken header "
+            f"(it begins with {data[:12]!r}); replace or remove the file"
+        ) from error
     except Image.DecompressionBombError as error:
-        raise InputError(f"{name}: {error}; at most {MAX_IMAGE_PIXELS} pixels are read") from error
+        raise InputError(
+            f"{name}: its header tells of more pixels than a camera's; at most {MAX_IMAGE_PIXELS:,} are read; scale it"
+        ) from error
     if image.width * image.height > MAX_IMAGE_PIXELS:
         raise InputError(
-            f"{name}: {image.width} x {image.height} pixels, at most {MAX_IMAGE_PIXELS} are read; scale it"
+            f"{name}: {image.width} x {image.height} pixels; at most {MAX_IMAGE_PIXELS:,} are read; scale it"
         )
     return image
 
@@ -75,21 +106,39 @@ def _upright_turn(image: Image.Image) -> Image.Transpose | None:
         return None
 
 
+@contextmanager
+def no_ghostscript() -> Iterator[None]:
+    """Pillow starts no program in this block, whatever images a library opens there by itself."""
+    before, EpsImagePlugin.gs_binary = EpsImagePlugin.gs_binary, False
+    try:
+        yield
+    finally:
+        EpsImagePlugin.gs_binary = before
+
+
 def image_size(data: bytes, *, name: str) -> tuple[int, int]:
     """(width, height) as `decode_image` gives it, EXIF orientation applied, without decoding the pixels."""
     image = _open(data, name)
-    width, height = image.size
+    width, height = (image.tag_v2[256], image.tag_v2[257]) if isinstance(image, TiffImageFile) else image.size
     return (height, width) if _upright_turn(image) in SIDEWAYS else (width, height)
 
 
 def read_image(path: Path | str, *, mode: str = "RGB") -> UInt8[np.ndarray, "height width *channels"]:
     """`decode_image` of a file."""
-    path = Path(path)
+    return decode_image(read_encoded(path), name=str(path), mode=mode)
+
+
+def read_encoded(path: Path | str) -> bytes:
+    """The bytes of an image file as they are; `InputError` when they cannot be read or are absurdly many."""
     try:
-        data = path.read_bytes()
+        with Path(path).open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            data = file.read() if size <= MAX_IMAGE_BYTES else b""
     except OSError as error:
-        raise InputError(f"{path}: image cannot be read ({error.strerror})") from error
-    return decode_image(data, name=str(path), mode=mode)
+        raise InputError(f"{path}: image cannot be read ({error.strerror}); replace or remove it") from error
+    if size > MAX_IMAGE_BYTES:
+        raise InputError(f"{path}: expected an image of at most {MAX_IMAGE_BYTES:,} bytes, found {size:,}; scale it")
+    return data
 
 
 def encode_png(pixels: Shaped[np.ndarray, "height width *channels"]) -> bytes:
@@ -120,13 +169,10 @@ def encode_depth(depth_m: Float[np.ndarray, "height width"]) -> bytes:
 
 def decode_depth(data: bytes, *, name: str) -> Float[np.ndarray, "height width"]:
     """Metres, NaN where there is no depth."""
-    image = _open(data, name)
+    image = _load(data, name)
     if image.mode not in ("I;16", "I;16B", "I"):  # older Pillow opens 16-bit PNG as "I"
         raise InputError(f"{name}: expected a 16-bit grey depth image, found mode {image.mode}")
-    try:
-        steps = np.array(image).astype(np.float32)
-    except BROKEN as error:
-        raise InputError(f"{name}: depth image is broken or truncated ({error}); replace or remove the file") from error
+    steps = np.array(image).astype(np.float32)
     return np.where(steps > 0, steps / DEPTH_STEPS_PER_METRE, np.nan).astype(np.float32)
 
 

@@ -9,6 +9,7 @@ import tyro
 from carstudio.commands.command import Outcome, Output
 from carstudio.dataset.store import PatchStore, open_store
 from carstudio.errors import InputError
+from carstudio.files import inside
 from carstudio.images import write_png
 from carstudio.report.panels import encode_patch, turntable
 from carstudio.report.video import write_gif, write_mp4
@@ -57,7 +58,7 @@ class Render(Output):
                 frames = turntable(
                     model, latents, box, views=self.views, size_px=self.size, elevation_deg=self.elevation
                 )
-                folder = self.out / patch_id
+                folder = inside(self.out, patch_id)  # the id may come from a store that another program wrote
                 write_png(folder / "input.png", prepared.rgb.numpy())
                 for name in ("rgb", "opacity", "depth"):
                     for i, frame in enumerate(getattr(frames, name)):

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, UInt8
 
 from carstudio.dataset.patch import MaskValue, PatchRecord
+from carstudio.dataset.schema import check_id
 from carstudio.dataset.sources.frame import Frame, LabelledObject
 from carstudio.errors import InputError
 from carstudio.geometry.box3d import Box3D, envelope, projected_hull_points
@@ -97,15 +98,27 @@ def records_of_frame(
 ) -> FrameResult:
     """Every object of the given types as a record, but those already `done`; a bad object costs only itself."""
     pixels = decode_image(frame.image, name=frame.image_path)
-    records, problems = [], []
+    records, problems, seen = [], [], set[str]()
     for thing in frame.objects:
-        if thing.type not in types or thing.patch_id in done:
+        if thing.type not in types:
             continue
         try:
+            _check_ids(thing, seen)
+            seen.add(thing.patch_id)
+            if thing.patch_id in done:
+                continue
             records.append(_record(frame, thing, pixels, segmenter, source, licence))
         except InputError as error:
             problems.append(f"{thing.patch_id}: {error}")
     return FrameResult(tuple(records), tuple(problems))
+
+
+def _check_ids(thing: LabelledObject, seen: set[str]) -> None:
+    """What the store would refuse in the middle of a build is a problem of the object alone."""
+    check_id(thing.patch_id, "patch id")
+    check_id(thing.instance_id, "instance id")
+    if thing.patch_id in seen:
+        raise InputError("the frame has this object twice (one frame, one track); the first is kept")
 
 
 def _record(

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from carstudio.errors import InputError
+from carstudio.files import inside
 from carstudio.images import read_image
 from carstudio.perception.hulls import allowed_pixels, occluded_pixels
 from carstudio.perception.results import MaskResult, SegmentRequest
@@ -27,15 +28,19 @@ class PrecomputedSegmenter:
 
     def segment(self, request: SegmentRequest) -> MaskResult:
         """The patch's mask, else the car's part of the photograph's."""
-        path = self.folder / f"{request.patch_id}.png"
+        path = inside(self.folder, f"{request.patch_id}.png")
         if path.is_file():
             return result_from_pixels(read_image(path, mode="L"), request, name=str(path), score=None)
-        path = self.folder / f"{request.frame_id}.png"
+        path = inside(self.folder, f"{request.frame_id}.png")
         if not path.is_file():
-            raise InputError(f"{self.folder}: no mask {request.patch_id}.png and no {request.frame_id}.png")
+            raise InputError(
+                f"{self.folder}: no mask {request.patch_id}.png and no {request.frame_id}.png; put one of them there"
+            )
         pixels = read_image(path, mode="L")
         if pixels.shape != request.image.shape[:2]:
-            raise InputError(f"{path}: mask must have the photograph's size {_size(request.image)}, is {_size(pixels)}")
+            raise InputError(
+                f"{path}: mask must have the photograph's size {_size(request.image)}, is {_size(pixels)}; make it again"
+            )
         window = request.window
         allowed = allowed_pixels(request, 0.0, window)
         result = result_from_pixels(pixels[window.slices], request, name=str(path), score=None)
@@ -49,7 +54,7 @@ def result_from_pixels(
     """Masks of a grey image of the crop."""
     if pixels.shape != (request.window.height, request.window.width):
         expected = f"{request.window.width} x {request.window.height}"
-        raise InputError(f"{name}: mask must have the crop's size {expected}, is {_size(pixels)}")
+        raise InputError(f"{name}: mask must have the crop's size {expected}, is {_size(pixels)}; make it again")
     unknown = pixels == UNKNOWN_GREY
     return MaskResult((pixels > 0) & ~unknown, unknown, score)
 

@@ -14,7 +14,7 @@ from carstudio.evaluation.protocols import EvaluationConfig, Protocol, ScoredVie
 from carstudio.evaluation.scored_run import ScoredRun, score_run
 from carstudio.evaluation.summary import Summary, summarise
 from carstudio.evaluation.tables import result_tables, to_markdown
-from carstudio.files import require_writable, write_text
+from carstudio.files import inside, require_writable, write_text
 from carstudio.images import encode_png, to_uint8, write_png
 from carstudio.models.interface import CategoryModel
 from carstudio.progress import Report, silent
@@ -184,7 +184,7 @@ def _turntables(
         prepared, latents, box = encode_patch(model, store, patch_id)
         frames = turntable(model, latents, box, views=30, size_px=160)
         photo = fit(prepared.rgb.numpy(), 160, 160)
-        path = out / "turntables" / f"{patch_id}.gif"
+        path = inside(out / "turntables", f"{patch_id}.gif")
         write_gif(path, [np.concatenate([photo, frame], axis=1) for frame in frames.rgb], fps=10.0)
         pictures.append(Picture(source=path.read_bytes(), caption=patch_id, alt="photo, and the car turning"))
         report("turntables", done, len(chosen), patch_id)

@@ -8,6 +8,7 @@ import trimesh
 from jaxtyping import Float
 
 from carstudio.errors import InputError
+from carstudio.images import no_ghostscript
 from carstudio.synthetic.cars import Car
 from carstudio.synthetic.materials import Material, linear_from_srgb
 from carstudio.synthetic.surfaces import NO_CHART, CarMesh, Chart
@@ -22,15 +23,12 @@ def load_glb(path: Path | str) -> Car:
     """The car of a GLB file; `InputError` when it cannot be read or is no car in metres along +Z."""
     path = Path(path)
     try:
-        scene = trimesh.load_scene(path)
-    except Exception as error:  # trimesh raises whatever its parsers raise
-        raise InputError(f"{path}: cannot be read as a mesh ({type(error).__name__}: {error})") from error
-    pieces = []
-    for node in scene.graph.nodes_geometry:
-        transform, name = scene.graph[node]
-        geometry = scene.geometry[name]
-        if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
-            pieces.append(_piece(geometry, np.asarray(transform)))
+        with no_ghostscript():  # a texture may be anything that Pillow opens
+            pieces = _pieces(trimesh.load_scene(path))
+    except Exception as error:  # trimesh raises whatever its parsers raise, broken textures when they are looked at
+        raise InputError(
+            f"{path}: cannot be read as a mesh ({type(error).__name__}: {error}); export it again as GLB"
+        ) from error
     if not pieces:
         raise InputError(f"{path}: expected triangles, found none")
     mesh = _join(pieces)
@@ -41,6 +39,16 @@ def load_glb(path: Path | str) -> Car:
             f"found {length:.2f} x {height:.2f} x {width:.2f} m (length along Z, height, width); scale or turn it"
         )
     return Car(mesh, path.stem, None)
+
+
+def _pieces(scene: trimesh.Scene) -> list[dict[str, Any]]:
+    pieces = []
+    for node in scene.graph.nodes_geometry:
+        transform, name = scene.graph[node]
+        geometry = scene.geometry[name]
+        if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
+            pieces.append(_piece(geometry, np.asarray(transform)))
+    return pieces
 
 
 def _piece(geometry: trimesh.Trimesh, transform: Float[np.ndarray, "4 4"]) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 A car has no identity across images here: each patch is its own instance.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,9 @@ from carstudio.dataset.sources.kitti_format import (
     read_text,
 )
 from carstudio.errors import InputError
+from carstudio.images import read_encoded
 
+_NUMBERED = re.compile(r"\d{1,9}", re.ASCII)  # fits 32 bits
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
@@ -55,7 +58,7 @@ class KittiDetSource:
         return Frame(
             frame_id=ref.stem,
             image_path=image.relative_to(self.folder).as_posix(),
-            image=image.read_bytes(),
+            image=read_encoded(image),
             intrinsics=calibration.intrinsics,
             camera_offset=calibration.camera_offset,
             camera_source="calib:P2",
@@ -73,7 +76,8 @@ def open_kitti_det(root: Path, *, frames: str | None = None, camera_offset: Came
 def list_frames(folder: Path, frames: str | None, sequence_id: str | None = None) -> tuple[FrameRef, ...]:
     """The numbered images of a folder within `frames` (A-B), in order of their number."""
     limits = parse_frame_range(frames)
-    stems = {path.stem for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.stem.isdecimal()}
+    images = (path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES)
+    stems = {path.stem for path in images if _NUMBERED.fullmatch(path.stem)}
     refs = [FrameRef(sequence_id, int(stem), stem) for stem in stems]
     if limits is not None:
         refs = [ref for ref in refs if limits[0] <= ref.index <= limits[1]]

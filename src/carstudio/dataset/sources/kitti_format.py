@@ -6,6 +6,7 @@ number and the track id in front. Described in the KITTI devkits' readme files.
 """
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +24,11 @@ _FIELDS = (
     "truncation", "occlusion", "alpha", "x0", "y0", "x1", "y1", "height", "width", "length", "x", "y", "z",
     "rotation_y", "score",
 )  # fmt: skip
+_NUMBER = re.compile(
+    r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII
+)  # `float` takes 1_0 and other alphabets' digits
+_WHOLE = re.compile(r"-?\d{1,9}", re.ASCII)  # frames and tracks fit 32 bits
+_SQUARE_TOLERANCE = 1e-6  # of fx, fy and 1: how far from a pinhole's zeros and one a calibration may lie
 _OCCLUSION_UNKNOWN = 3  # the devkit: 0 visible, 1 partly, 2 largely occluded, 3 unknown
 
 
@@ -78,10 +84,7 @@ def parse_label(line: str, *, where: str) -> KittiLabel:
 
 
 def _number(word: str, name: str, where: str) -> float:
-    try:
-        value = float(word)
-    except ValueError:
-        value = math.nan
+    value = float(word) if _NUMBER.fullmatch(word) else math.nan
     if not math.isfinite(value):
         raise InputError(f"{where}: {name} must be a finite number, found {word!r}")
     return value
@@ -89,7 +92,7 @@ def _number(word: str, name: str, where: str) -> float:
 
 def parse_labels(text: str, *, name: str) -> list[KittiLabel]:
     """All objects of a detection label file; empty lines are skipped."""
-    lines = enumerate(text.splitlines(), start=1)
+    lines = enumerate(text.split("\n"), start=1)  # as editors count; `splitlines` would also cut at rarer marks
     return [parse_label(line, where=f"{name} line {number}") for number, line in lines if line.strip()]
 
 
@@ -106,17 +109,17 @@ def group_tracking_lines(text: str, *, name: str) -> tuple[dict[int, list[Tracki
     """Lines by frame number, and one sentence for each line whose frame or track cannot be read."""
     frames: dict[int, list[TrackingLine]] = {}
     problems = []
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(text.split("\n"), start=1):
         if not line.strip():
             continue
         where = f"{name} line {number}"
         words = line.split(maxsplit=2)
-        try:
-            frame, track_id, rest = int(words[0]), int(words[1]), words[2]
-        except (ValueError, IndexError):
+        if len(words) < 3 or not all(_WHOLE.fullmatch(word) for word in words[:2]):
             problems.append(f"{where}: expected 'frame track type ...', found {line.strip()[:60]!r}; line skipped")
-            continue
-        frames.setdefault(frame, []).append(TrackingLine(track_id, rest, where))
+        elif words[1].startswith("-") and words[2].split()[0] != DONT_CARE:
+            problems.append(f"{where}: track must be 0 or more (-1 is for {DONT_CARE}), found {words[1]}; line skipped")
+        else:
+            frames.setdefault(int(words[0]), []).append(TrackingLine(int(words[1]), words[2], where))
     return frames, tuple(problems)
 
 
@@ -124,10 +127,11 @@ def parse_calibration(
     text: str, *, name: str, key: str = "P2", camera_offset: CameraOffset = "exact"
 ) -> KittiCalibration:
     """Camera `key` of a calibration file; keys with or without a colon (the tracking files mix both)."""
-    for line in text.splitlines():
-        words = line.split()
+    for number, line in enumerate(text.split("\n"), start=1):
+        words, where = line.split(), f"{name} line {number}"
         if words and words[0].rstrip(":") == key:
-            calibration = _calibration([_number(word, key, name) for word in words[1:]], name, key)
+            numbers = [_number(word, f"number {i} of {key}", where) for i, word in enumerate(words[1:], start=1)]
+            calibration = _calibration(numbers, where, key)
             return calibration if camera_offset == "exact" else replace(calibration, camera_offset=(0.0, 0.0, 0.0))
     raise InputError(f"{name}: no line {key}; expected a KITTI calibration file with P0 to P3")
 
@@ -137,8 +141,12 @@ def _calibration(values: Sequence[float], name: str, key: str) -> KittiCalibrati
         raise InputError(f"{name}: {key} must have 12 numbers (3 x 4, row by row), found {len(values)}")
     projection = torch.tensor(values, dtype=torch.float64).reshape(3, 4)
     fx, fy, cx, cy = (float(projection[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    if fx <= 0 or fy <= 0 or float(projection[2, 2]) <= 0:
+    if fx <= 0 or fy <= 0:
         raise InputError(f"{name}: {key} must have positive focal lengths, found ({fx}, {fy}) px")
+    pinhole = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+    if ((projection[:, :3] - pinhole).abs() > _SQUARE_TOLERANCE * pinhole.diag()[:, None]).any():
+        rows = " / ".join(" ".join(f"{value:g}" for value in row[:3]) for row in projection.tolist())
+        raise InputError(f"{name}: {key} must begin fx 0 cx / 0 fy cy / 0 0 1 (a pinhole camera), found {rows}")
     x, y, z = camera_offset_from_projection(projection).tolist()
     if not all(math.isfinite(value) for value in (x, y, z)):
         raise InputError(f"{name}: {key} cannot be inverted (focal lengths {fx}, {fy} px); expected a camera's matrix")
@@ -160,11 +168,11 @@ def center_in_camera(label: KittiLabel, camera_offset: Vector3) -> Vector3 | Non
 def read_text(path: Path, what: str) -> str:
     """Text of a KITTI file; `InputError` names what is missing."""
     try:
-        return path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8-sig")  # Windows editors put a mark in front that would hide the first key
     except OSError as error:
-        raise InputError(f"{path}: {what} cannot be read ({error.strerror})") from error
+        raise InputError(f"{path}: {what} cannot be read ({error.strerror}); restore it") from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected {what} as text, found binary data") from error
+        raise InputError(f"{path}: expected {what} as UTF-8 text, found binary data; restore it") from error
 
 
 def find_layout(root: Path, images: str, example: str) -> Path:

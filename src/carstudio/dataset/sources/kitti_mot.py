@@ -21,6 +21,7 @@ from carstudio.dataset.sources.kitti_format import (
     read_text,
 )
 from carstudio.errors import InputError
+from carstudio.images import read_encoded
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ class KittiMotSource:
             sequence_id=ref.sequence_id,
             frame_index=ref.index,
             image_path=image.relative_to(self.folder).as_posix(),
-            image=image.read_bytes(),
+            image=read_encoded(image),
             intrinsics=drive.calibration.intrinsics,
             camera_offset=drive.calibration.camera_offset,
             camera_source="calib:P2",
@@ -76,7 +77,7 @@ class KittiMotSource:
 def open_kitti_mot(
     root: Path, *, sequence: str | None = None, frames: str | None = None, camera_offset: CameraOffset = "exact"
 ) -> KittiMotSource:
-    """One sequence or all of them; `InputError` when there is none."""
+    """One sequence, or all of them but the broken; `InputError` when there is none."""
     folder = find_layout(root, "image_02", "image_02/SEQ, label_02/SEQ.txt, calib/SEQ.txt")
     names = sorted(path.name for path in (folder / "image_02").iterdir() if path.is_dir())
     if sequence is not None and sequence not in names:
@@ -89,9 +90,17 @@ def open_kitti_mot(
         sequence_refs = list_frames(folder / "image_02" / name, frames, sequence_id=name)
         if not sequence_refs:
             continue
-        drives[name], found = _open_sequence(folder, name, camera_offset)
+        try:
+            drives[name], found = _open_sequence(folder, name, camera_offset)
+        except InputError as error:
+            if len(chosen) == 1:
+                raise
+            problems.append(f"sequence {name} skipped: {error}")
+            continue
         refs += sequence_refs
         problems += found
+    if problems and not refs:
+        raise InputError(f"{folder}: no sequence can be read\n" + "\n".join(problems))
     refs_found = require_frames(refs, folder / "image_02", frames)
     return KittiMotSource(folder, refs_found, drives, problems=tuple(problems))
 
