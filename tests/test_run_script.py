@@ -60,7 +60,7 @@ def door(checkout: Path, *arguments: str, shell: str = "sh", **variables: str) -
 def test_without_an_argument_it_helps(checkout, shell):
     ended = door(checkout, shell=shell)
     assert ended.returncode == 0
-    for verb in ("demo", "test", "carstudio", "python", "bench", "faults", "lint", "setup"):
+    for verb in ("demo", "test", "carstudio", "python", "bench", "faults", "fuzz", "lint", "setup"):
         assert f"./run {verb}" in ended.stdout
 
 
