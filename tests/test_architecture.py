@@ -19,7 +19,7 @@ MAY_IMPORT = {
     "signals": set(),
     "allocator": set(),
     "files": {"errors"},
-    "locks": {"errors"},
+    "locks": {"errors", "files"},
     "images": {"errors", "files"},
     "geometry": set(),
     "rendering": {"geometry"},

@@ -1,5 +1,6 @@
 """Files are whole or absent, equal values give equal bytes, and a name from a data file stays in its folder."""
 
+import errno
 import hashlib
 import json
 import os
@@ -11,8 +12,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from carstudio.errors import InputError
-from carstudio.files import atomic_path, inside, read_json, sha256_file, write_bytes, write_json, write_text
+from carstudio.errors import InputError, StorageError
+from carstudio.files import (
+    atomic_path,
+    inside,
+    is_partial,
+    parse_json,
+    read_json,
+    remove_partials,
+    require_writable,
+    sha256_file,
+    write_bytes,
+    write_json,
+    write_text,
+)
 
 
 def test_what_is_written_is_read(tmp_path):
@@ -52,6 +65,36 @@ def test_a_kill_in_the_middle_leaves_the_old_file(tmp_path):
     ended = subprocess.run([sys.executable, "-c", program, str(tmp_path / "a.txt")], check=False)
     assert ended.returncode != 0
     assert (tmp_path / "a.txt").read_text() == "old"
+
+
+def test_what_the_system_refuses_names_the_file_and_leaves_the_old_one(tmp_path):
+    write_text(tmp_path / "a.txt", "old")
+    with pytest.raises(StorageError) as refused, atomic_path(tmp_path / "a.txt"):
+        raise OSError(errno.ENOSPC, "pyarrow's words for it")
+    assert f"{tmp_path / 'a.txt'}: cannot be written (No space left on device)" in str(refused.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.txt"]
+    with pytest.raises(InputError, match=r"a\.txt: expected a folder, found a file"):
+        require_writable(tmp_path / "a.txt" / "b.txt")
+    with pytest.raises(FileNotFoundError, match=r"photo\.png"), atomic_path(tmp_path / "b.txt"):
+        (tmp_path / "photos" / "photo.png").read_bytes()  # about another file: not for us to translate
+
+
+def test_only_leftovers_of_ours_are_removed(tmp_path):
+    names = [
+        ".a-abc_1234.partial.txt",
+        "deep/.b-zzzzzzzz.partial",
+        "a.txt",
+        ".hidden",
+        ".a.partial.txt",
+        "b-abc.partial",
+    ]
+    for name in names:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    remove_partials(tmp_path)
+    assert sorted(p.name for p in tmp_path.rglob("*") if p.is_file()) == sorted(names[2:])
+    require_writable(tmp_path / "a.txt")
+    assert is_partial(tmp_path / ".a-abc_1234.partial.txt")
 
 
 @pytest.mark.skipif(os.name != "posix", reason="permission bits")
@@ -137,3 +180,9 @@ def test_a_sibling_with_the_same_beginning_is_outside(tmp_path):
     (tmp_path / "store").mkdir()
     with pytest.raises(InputError, match="leaves its folder"):
         inside(tmp_path / "store", "../store-other/a.png")
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000, "9" * 10_000, b"\xff\xfe\x00", "{'a': 1}"])
+def test_json_that_no_file_of_ours_holds_is_the_users_error(text, tmp_path):
+    with pytest.raises(InputError, match="here: expected JSON, found"):
+        parse_json(text, name="here")

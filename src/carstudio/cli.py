@@ -27,8 +27,11 @@ if TYPE_CHECKING:
 VERBS = {
     "demo": ("carstudio.commands.demo:Demo", "nothing -> the whole path on synthetic cars, with an HTML report"),
     "synth": ("carstudio.commands.synth:Synth", "nothing or meshes -> photographs of synthetic cars with exact truth"),
-    "build": ("carstudio.commands.build:Build", "KITTI-DET or KITTI-MOT -> CarPatch3D"),
-    "dataset": ("carstudio.commands.dataset:Dataset", "CarPatch3D -> counts (info) or a check of every byte (verify)"),
+    "build": ("carstudio.commands.build:Build", "KITTI-DET, KITTI-MOT or the authors' json -> CarPatch3D"),
+    "dataset": (
+        "carstudio.commands.dataset:Dataset",
+        "CarPatch3D -> counts, a check of every byte, new verdicts, the authors' format",
+    ),
     "train": ("carstudio.commands.train:Train", "recipe + CarPatch3D -> trained model"),
     "evaluate": ("carstudio.commands.evaluate:Evaluate", "trained model + protocol -> result rows and their table"),
     "report": ("carstudio.commands.report:WriteReport", "trained model + store -> both protocols, pictures, one page"),

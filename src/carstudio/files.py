@@ -12,6 +12,7 @@ from typing import Any
 
 from carstudio.errors import InputError, StorageError
 
+_HALF_PAIR = re.compile(r"\\u[dD][89a-fA-F]")
 _PARTIAL = re.compile(r"\..*-[a-z0-9_]{8}\.partial(\.[^.]+)?")  # the temporary names of `atomic_path`
 
 
@@ -48,9 +49,17 @@ def require_writable(path: Path | str) -> None:
         raise StorageError(path, error.strerror) from error
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder and those above it, unless it is there; `InputError` when a file has its name."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as error:
+        raise InputError(f"{folder}: expected a folder, found a file; choose another place") from error
+
+
 def _new_partial(path: Path) -> Path:
     """An empty file with a temporary name beside `path`, whose folder is made when it is missing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(path.parent)
     handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=f".partial{path.suffix}", dir=path.parent)
     os.close(handle)
     return Path(name)
@@ -91,14 +100,29 @@ def write_json(path: Path | str, value: Any) -> None:
 
 
 def read_json(path: Path | str) -> Any:
-    """Read a JSON file; `InputError` names the file and the line when it is missing or not JSON."""
+    """Read a JSON file; `InputError` names the file and the place when it is missing or not JSON."""
     path = Path(path)
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return parse_json(path.read_bytes(), name=str(path))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); expected a JSON file") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: expected JSON, found something else ({error})") from error
+
+
+def parse_json(text: str | bytes, *, name: str) -> Any:
+    """A JSON value; `InputError` for anything else, nesting and numbers that no file of ours has included.
+
+    Its texts can be written as UTF-8: an escaped half of a surrogate pair without the other is refused too.
+    """
+    try:
+        value = json.loads(text)
+        if _HALF_PAIR.search(text if isinstance(text, str) else text.decode()):
+            json.dumps(value, ensure_ascii=False).encode()
+        return value
+    except ValueError as error:  # JSONDecodeError, UnicodeDecodeError, and Python's limit on the digits of a number
+        shown = text[:60] if isinstance(text, str) else text[:60].decode("utf-8", errors="replace")
+        raise InputError(f"{name}: expected JSON, found {shown!r} ({error})") from error
+    except RecursionError as error:
+        raise InputError(f"{name}: expected JSON, found one value in another, hundreds deep") from error
 
 
 def sha256_file(path: Path | str) -> str:

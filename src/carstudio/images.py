@@ -5,18 +5,20 @@ Arrays are numpy, (height, width[, channels]). Depth images follow KITTI: value 
 
 import io
 import struct
+import warnings
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from carstudio.errors import InputError
 from carstudio.files import write_bytes
 
 MAX_IMAGE_PIXELS = 120_000_000  # 12,000 x 10,000: larger than any camera's photo, small enough for a laptop's memory
 DEPTH_STEPS_PER_METRE = 256.0  # KITTI's depth PNG
-BROKEN = (OSError, ValueError, SyntaxError, EOFError)  # what Pillow raises on damaged files
+# What Pillow raises on damaged files, as fuzzing found.
+BROKEN = (OSError, ValueError, SyntaxError, EOFError, TypeError, KeyError, IndexError, OverflowError, struct.error)
 TURNS = {  # EXIF orientation -> what turns the stored pixels upright; 1 (and anything unknown) is upright
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -50,8 +52,10 @@ def _open(data: bytes, name: str) -> Image.Image:
     if not data:
         raise InputError(f"{name}: expected an image, found an empty file; replace or remove it")
     try:
-        image = Image.open(io.BytesIO(data))
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
+        with warnings.catch_warnings():  # our own bound follows
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            image = Image.open(io.BytesIO(data))
+    except BROKEN as error:
         raise InputError(f"{name}: expected an image (PNG, JPEG, ...), found something else ({error})") from error
     except Image.DecompressionBombError as error:
         raise InputError(f"{name}: {error}; at most {MAX_IMAGE_PIXELS} pixels are read") from error
@@ -66,7 +70,7 @@ def _upright_turn(image: Image.Image) -> Image.Transpose | None:
     """What turns the stored pixels upright by their EXIF orientation; broken EXIF counts as none."""
     try:
         return TURNS.get(image.getexif().get(0x0112, 1))
-    except (*BROKEN, struct.error, KeyError, IndexError, TypeError):
+    except BROKEN:
         return None
 
 

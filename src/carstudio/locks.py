@@ -13,6 +13,7 @@ from types import TracebackType
 from typing import IO
 
 from carstudio.errors import InputError, StorageError
+from carstudio.files import make_folder, remove_partials
 
 try:
     import fcntl
@@ -33,7 +34,7 @@ class FolderLock:
         self._path = self.folder / LOCK_NAME
         self._file: IO[bytes] | None = None
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
+            make_folder(self.folder)
             self._acquire()
         except OSError as error:
             raise StorageError(self.folder, error.strerror or error) from error
@@ -76,6 +77,12 @@ class FolderLock:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.release()
+
+
+def clear_leftovers(folder: Path | str) -> None:
+    """Remove what a killed writer left in a folder that is whole, unless somebody is writing or nobody may."""
+    with suppress(InputError), FolderLock(folder):
+        remove_partials(folder)
 
 
 def _lock(file: IO[bytes]) -> bool:

@@ -164,7 +164,7 @@ def test_numbers_that_ran_away_are_told_without_a_traceback(
     shown = capsys.readouterr().err
     assert shown.startswith("error: step 0: loss term ")
     assert "is nan for cars ['toy-" in shown
-    assert "resume with another --seed" in shown
+    assert "--resume with a lower --learning-rate, or with another --seed" in shown
     assert "Traceback" not in shown
 
 

@@ -114,10 +114,43 @@ def test_an_interrupted_build_goes_on_to_the_same_bytes(root: Path, tmp_path: Pa
     assert tree(tmp_path / "s") == tree(tmp_path / "whole")
 
 
+def test_a_finished_build_started_again_is_done_and_with_other_settings_refused(root: Path, tmp_path: Path) -> None:
+    """A job killed between its last write and its end is started again by its batch system."""
+    config = BuildConfig(source="kitti-mot", root=root, out=tmp_path / "s", workers=1)
+    first = build(config)
+    before = {path: path.read_bytes() for path in (tmp_path / "s").rglob("*") if path.is_file()}
+    (tmp_path / "s" / ".lock").touch()
+    again = build(replace(config, workers=2))
+    assert replace(again, seconds=0.0) == replace(first, problems=(), seconds=0.0)
+    assert before == {path: path.read_bytes() for path in (tmp_path / "s").rglob("*") if path.is_file()}
+    for changes in ({"filters": FilterRecipe(depth_m=5.0)}, {"frames": "0-1"}):
+        with pytest.raises(InputError, match="already holds a finished store"):
+            build(replace(config, **changes))  # type: ignore[arg-type]
+    shutil.rmtree(tmp_path / "s" / "runs")
+    with pytest.raises(InputError, match="already holds a finished store"):
+        build(config)
+
+
+@pytest.mark.parametrize("step", ["judge_store", "write_splits"])
+def test_finished_is_said_last(root: Path, tmp_path: Path, step: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def die(*arguments: object) -> None:
+        raise KeyboardInterrupt
+
+    config = BuildConfig(source="kitti-mot", root=root, out=tmp_path / "s", workers=1)
+    with monkeypatch.context() as patched:
+        patched.setattr(f"carstudio.dataset.build.{step}", die)
+        with pytest.raises(KeyboardInterrupt):
+            build(config)
+    assert not open_store(tmp_path / "s").manifest.is_finished
+    build(config)
+    build_small(root, tmp_path / "whole")
+    assert tree(tmp_path / "s") == tree(tmp_path / "whole")
+
+
 def test_refilter_looks_only_at_stored_values(root: Path, tmp_path: Path) -> None:
     store = build_small(root, tmp_path / "s")
-    strict = judge_store(store, FilterRecipe(depth_m=5.5, height_px=1.0, width_px=1.0, mask_ratio=0.0, box_iou=0.0))
-    assert [verdict.reason for verdict in strict] == ["depth_m", "depth_m", "kept"]
+    judge_store(store, FilterRecipe(depth_m=5.5, height_px=1.0, width_px=1.0, mask_ratio=0.0, box_iou=0.0))
+    assert [verdict.reason for verdict in store.verdicts()] == ["depth_m", "depth_m", "kept"]
     assert open_store(tmp_path / "s").patch_ids() == ["km-0000-000001-007"]
 
 

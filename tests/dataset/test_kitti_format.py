@@ -97,6 +97,9 @@ BROKEN_CALIBRATIONS = {
     "calib/1.txt: P2 must have 12 numbers (3 x 4, row by row), found 3": "P2: 1 2 3\n",
     "calib/1.txt: P2 must be a finite number, found 'x'": "P2: 1 2 x\n",
     "calib/1.txt: P2 must have positive focal lengths, found (0.0, 7.0) px": "P2: 0 0 6 0 0 7 1 0 0 0 1 0\n",
+    "calib/1.txt: P2 cannot be inverted (focal lengths 1e-320, 7.0 px); expected a camera's matrix": (
+        "P2: 1e-320 0 6 0 0 7 1 0 0 0 1 0\n"
+    ),
 }
 
 

@@ -208,6 +208,41 @@ def test_an_unfinished_store_starts_over_with_another_key(tmp_path: Path) -> Non
     assert open_store(path).patch_ids() == ["ko-000500-000"]
 
 
+def test_what_kills_left_is_cleared_and_is_no_foreign_file(tmp_path: Path) -> None:
+    """A kill during the very first write leaves a folder with hidden files and no manifest."""
+    path = tmp_path / "s"
+    path.mkdir()
+    for name in (".lock", ".manifest-abc_1234.partial.json"):
+        (path / name).touch()
+    write_store(path, 3)
+    assert [name for name in tree(path) if "/." in f"/{name}"] == []
+    write_store(tmp_path / "whole", 3)
+    assert tree(path) == tree(tmp_path / "whole")
+
+
+def test_starting_over_can_be_killed_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of another run's shards are gone when the kill comes: that run must not go on with the other half."""
+    path = tmp_path / "s"
+    with pytest.raises(RuntimeError):
+        write_and_fail(path, 200)
+    real, gone = Path.unlink, []
+
+    def dying_unlink(self: Path, missing_ok: bool = False) -> None:
+        if self.name.startswith("part-"):
+            if gone:
+                raise KeyboardInterrupt
+            gone.append(self)
+        real(self, missing_ok)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "unlink", dying_unlink)
+        with pytest.raises(KeyboardInterrupt):
+            StoreWriter(path, source="kitti-det", groups_per_shard=1, resume_key="b")
+    assert len(open_store(path)) == 128
+    with StoreWriter(path, source="kitti-det", groups_per_shard=1, resume_key="a") as writer:
+        assert len(writer) == 0
+
+
 def test_append_adds_shards_and_leaves_the_others_alone(tmp_path: Path) -> None:
     path = tmp_path / "s"
     write_store(path, 70)
@@ -267,7 +302,7 @@ def test_open_store_explains_what_it_cannot_open(tmp_path: Path) -> None:
         open_store(tmp_path / "s")
     manifest.write_text(json.dumps(content))
     (tmp_path / "s" / "data" / "part-00000.parquet").write_bytes(b"no parquet")
-    with pytest.raises(InputError, match="expected a Parquet file"):
+    with pytest.raises(InputError, match="expected a whole Parquet file"):
         len(open_store(tmp_path / "s"))
     (tmp_path / "s" / "data" / "part-00000.parquet").unlink()
     with pytest.raises(InputError, match="are missing"):

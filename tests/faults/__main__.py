@@ -33,6 +33,8 @@ def main(arguments: list[str]) -> int:
         for case in kill(names, options.kills, seed=options.seed, jobs=options.jobs, work=work):
             cases.append(case)
             progress.update(task, description=f"kills, last: {case.target}", advance=len(case.kills))
+            if options.minutes is not None and time.monotonic() - started > 60 * options.minutes:
+                break
     seconds = time.monotonic() - started
     console.print(summary(cases))
     failed = [case for case in cases if case.differences]
@@ -49,6 +51,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--kills", type=int, default=50, help="SIGKILLs in all (50)")
     parser.add_argument("--target", choices=[*TARGETS, "all"], default="all")
     parser.add_argument("--seed", type=int, default=0, help="chooses every kill's moment (0)")
+    parser.add_argument("--minutes", type=float, help="end after this time, with fewer kills")
     parser.add_argument("--jobs", type=int, default=2, help="runs at the same time (2)")
     parser.add_argument("--keep", help="folder for the runs; those that came out well are removed")
     options = parser.parse_args(arguments)

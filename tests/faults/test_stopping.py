@@ -6,15 +6,17 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from carstudio.signals import held_back_stops
+from carstudio.dataset.workers import _submit
+from carstudio.signals import STOP_SIGNALS, held_back_stops
 from faults.forks import Forks
 from faults.kills import compare, make_reference
-from faults.server import Request
+from faults.server import ORPHANS_MAY_TAKE_S, Request
 from faults.targets import TARGETS, TRAIN, files_of
 
 STOPS = {signal.SIGINT: 130, signal.SIGTERM: 143}
@@ -36,19 +38,32 @@ def long_run(verb: str, inputs: Path, trained: Path, out: Path) -> list[str]:
     return ["demo", *many] if verb == "demo" else ["synth", *many, "--size", "256", "--workers", verb[-1]]
 
 
-# The time is spent in: workers that start, a picture, workers at work, a step, scoring, a picture, workers.
-CASES = [("build", 0.4), ("synth-1", 0.8), ("synth-2", 4.0), ("train", 1.5), ("evaluate", 0.05), ("render", 0.6)]
+# When the signal comes: while workers start, at work in one process, in workers at work, in a step of training, before
+# the first score (the first file operation is the check that rows can be written), in a picture, among imports.
+CASES: list[tuple[str, dict[str, float]]] = [
+    ("build", {"after_s": 0.4}),
+    ("synth-1", {"after_s": 0.8}),
+    ("synth-2", {"after_s": 4.0}),
+    ("train", {"after_s": 1.5}),
+    ("evaluate", {"at_operation": 1}),
+    ("render", {"after_s": 0.8}),
+    ("demo", {"after_s": 0.5}),
+]
 
 
-@pytest.mark.parametrize(("verb", "after_s"), [*CASES, ("demo", 0.5)])
-@pytest.mark.parametrize("to_group", [True, False], ids=["to-all", "to-the-parent"])
+@pytest.mark.parametrize(
+    ("verb", "when", "to_group"),
+    [(*case, True) for case in CASES] + [(*case, False) for case in CASES if case[0] in ("build", "train", "demo")],
+)
 def test_a_verb_ends_and_says_how_to_go_on(
-    verb: str, after_s: float, to_group: bool, forks: Forks, inputs: Path, trained: Path, tmp_path: Path
+    verb: str, when: dict[str, float], to_group: bool, forks: Forks, inputs: Path, trained: Path, tmp_path: Path
 ) -> None:
     number = signal.SIGINT if to_group else signal.SIGTERM
     out, log = tmp_path / "out", tmp_path / "log"
     arguments = long_run(verb, inputs, trained, out)
-    ended = forks.run(Request(arguments=arguments, log=str(log), after_s=after_s, signal=number, to_group=to_group))
+    ended = forks.run(
+        Request(arguments=arguments, log=str(log), signal=number, to_group=to_group, **when)  # type: ignore[arg-type]
+    )
     shown = log.read_text()
     assert ended.code == STOPS[number], shown
     first, second, *rest = shown.splitlines()
@@ -56,6 +71,15 @@ def test_a_verb_ends_and_says_how_to_go_on(
     assert second.startswith(f"go on with: carstudio {arguments[0]} ")
     assert rest == []
     assert [path for path in files_of(out) if ".partial" in path] == []
+
+
+def test_workers_of_a_killed_parent_end_by_themselves(
+    forks: Forks, inputs: Path, trained: Path, tmp_path: Path
+) -> None:
+    arguments = long_run("synth-2", inputs, trained, tmp_path / "out")
+    ended = forks.run(Request(arguments=arguments, log=str(tmp_path / "log"), after_s=4.0, to_group=False))
+    assert ended.code == -signal.SIGKILL
+    assert ended.orphans_s < ORPHANS_MAY_TAKE_S, "they had to be killed"
 
 
 def test_training_goes_on_from_the_step_it_was_stopped_in(forks: Forks, inputs: Path, tmp_path: Path) -> None:
@@ -116,6 +140,14 @@ def test_what_is_deep_in_a_library_is_ended_by_the_watch() -> None:
     assert (process.returncode, said) == (143, "goodbye\n")
 
 
+def test_nothing_is_raised_while_modules_are_imported() -> None:
+    """Some libraries catch whatever is raised during their imports and go on."""
+    swallow = 'import os\ntry:\n    os.kill(os.getpid(), 15)\nexcept BaseException:\n    pass\nprint("still here")\n'
+    process = start(DEEP[: DEEP.index("hashlib.pbkdf2")] + swallow)
+    printed, said = process.communicate(timeout=60)
+    assert (process.returncode, printed, said) == (143, "", "goodbye\n")
+
+
 def test_a_second_signal_does_not_wait() -> None:
     patient = "import carstudio.commands.stopping as stopping\nstopping.GRACE_S = 3600\nwatch.start()"
     process = start(DEEP.replace("watch.start()", patient))
@@ -169,3 +201,23 @@ def test_nothing_held_back_changes_nothing() -> None:
     assert signal.getsignal(signal.SIGINT) == before
     with ThreadPoolExecutor(1) as pool:
         assert pool.submit(lambda: held_back_stops().__enter__()).result() == []
+
+
+def test_no_signal_is_heard_while_a_worker_starts() -> None:
+    """A worker started by a pool that was interrupted before it had noted it would be left alone."""
+    heard: list[int] = []
+    seen: list[object] = []
+
+    class Pool(ProcessPoolExecutor):
+        def submit(self, *arguments: Any) -> Future[Any]:  # type: ignore[override]  # it takes all and runs nothing
+            os.kill(os.getpid(), signal.SIGTERM)
+            seen.append((list(heard), signal.pthread_sigmask(signal.SIG_BLOCK, ()) >= set(STOP_SIGNALS)))
+            return Future()
+
+    before = signal.signal(signal.SIGTERM, lambda number, frame: heard.append(number))
+    try:
+        _submit(Pool(1), str, [1])
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert (seen, heard) == ([([], True)], [signal.SIGTERM])
+    assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()) & set(STOP_SIGNALS)

@@ -10,6 +10,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,7 @@ from faults.kills import compare, make_reference
 from faults.server import Request
 from faults.targets import TARGETS, TRAIN, Target, files_of
 
-BUILD, SYNTH = TARGETS["build"][0], TARGETS["synth"][0]
+BUILD = TARGETS["build"][0]
 
 
 def arguments_of(verb: str, inputs: Path, trained: Path, out: Path) -> list[str]:
@@ -78,7 +79,7 @@ def test_a_read_only_folder(verb: str, forks: Forks, inputs: Path, trained: Path
     assert forks.run(Request(arguments=arguments, log=str(log))).code == 0, log.read_text()
 
 
-@pytest.mark.parametrize(("target", "shares"), [(TRAIN, (0.35, 0.6, 0.95)), (BUILD, (0.2, 0.5, 0.8)), (SYNTH, (0.95,))])
+@pytest.mark.parametrize(("target", "shares"), [(TRAIN, (0.35, 0.6, 0.95)), (BUILD, (0.2, 0.5, 0.8))])
 def test_a_disk_that_fills_up_later_keeps_what_was_saved(
     target: Target, shares: tuple[float, ...], forks: Forks, inputs: Path, tmp_path: Path
 ) -> None:
@@ -99,6 +100,18 @@ def test_a_disk_that_fills_up_later_keeps_what_was_saved(
         assert f"go on with: carstudio {shlex.join(again)}\n" in shown
         assert forks.run(Request(arguments=again, log=str(log))).code == 0, log.read_text()
         assert compare(reference.snapshot, target.snapshot(out)) == ()
+
+
+@pytest.mark.slow
+def test_a_disk_that_is_full_from_any_operation_on(forks: Forks, inputs: Path, tmp_path: Path) -> None:
+    reference = make_reference(forks, BUILD, inputs, tmp_path / "reference")
+    for number in range(1, reference.operations + 1):
+        out, log = tmp_path / str(number), tmp_path / f"log-{number}"
+        request = Request(arguments=BUILD.arguments(inputs, out), log=str(log))
+        assert forks.run(replace(request, full_at_operation=number)).code in (0, 2), log.read_text()
+        assert "Traceback" not in log.read_text()
+        assert forks.run(request).code == 0, log.read_text()
+        assert compare(reference.snapshot, BUILD.snapshot(out)) == ()
 
 
 def can_mount() -> bool:

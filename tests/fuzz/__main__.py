@@ -10,13 +10,15 @@ import tempfile
 from pathlib import Path
 
 import torch
+from jaxtyping import install_import_hook
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from fuzz.campaign import Tally, attempt, run_campaign
-from fuzz.minimise import minimise, save_find
-from fuzz.targets import TARGETS
+with install_import_hook("carstudio", "beartype.beartype"):  # a value of another type or shape than promised is a find
+    from fuzz.campaign import Tally, attempt, run_campaign
+    from fuzz.minimise import minimise, save_find
+    from fuzz.targets import TARGETS
 
 
 def main(arguments: list[str]) -> int:

@@ -82,7 +82,7 @@ def _alarm(number: int, frame: object) -> None:
 
 def signature_of(error: BaseException) -> str:
     """Kind of the exception and the place in our sources (else in the target) where it passed."""
-    frames = traceback.extract_tb(error.__traceback__)
+    frames = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename != __file__]
     ours = [frame for frame in frames if "/carstudio/" in frame.filename] or frames
     last = ours[-1]
     return f"{type(error).__name__} at {Path(last.filename).name}:{last.lineno}"

@@ -1,4 +1,4 @@
-"""Targets: a trained model, the state a run goes on from, and files of result rows."""
+"""Targets: a trained model, the state a run goes on from, its log, and files of result rows."""
 
 import json
 import struct
@@ -9,14 +9,17 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import torch
+from safetensors import SafetensorError, safe_open
 from torch import nn
 
+from carstudio.errors import InputError
 from carstudio.evaluation.results import ResultHeader, ResultRow, read_header, read_rows, write_rows
 from carstudio.geometry.orbit import orbit_box, orbit_camera
 from carstudio.models.interface import PatchBatch, render_image
 from carstudio.models.zoo import build_model
-from carstudio.training.checkpoint import DESCRIPTION, WEIGHTS, load_model, save_model
-from carstudio.training.resume import STATE, TrainingState, load_state, save_state
+from carstudio.training.checkpoint import DESCRIPTION, WEIGHTS, load_model, load_tensors, save_model, save_tensors
+from carstudio.training.log import LOG, read_log
+from carstudio.training.resume import STATE, TrainingState, checksum, load_state, save_state
 from fuzz.edits import Files
 from fuzz.target import Target, write_files
 from training.toy import TINY
@@ -110,6 +113,21 @@ def state_seeds() -> list[Files]:
     return [{STATE: _state_file()}, take_apart(_state_file())]
 
 
+def mend_state(files: Files) -> Files:
+    """The header in one piece with its numbers, its checksum right where they can be read at all."""
+    joined = join(files, STATE)
+    try:
+        with TemporaryDirectory() as folder:
+            write_files(joined, Path(folder))
+            tensors = load_tensors(Path(folder) / STATE)
+            with safe_open(Path(folder) / STATE, "pt") as file:
+                metadata = {key: value for key, value in (file.metadata() or {}).items() if key != "sha256"}
+            save_tensors(Path(folder) / STATE, tensors, {**metadata, "sha256": checksum(tensors, metadata)})
+            return {STATE: (Path(folder) / STATE).read_bytes()}
+    except (InputError, SafetensorError, ValueError, RuntimeError):
+        return joined
+
+
 def read_state(files: Files, folder: Path) -> None:
     """What is resumed from goes on: one more step gives finite weights."""
     write_files(join(files, STATE), folder)
@@ -142,8 +160,18 @@ def read_result_rows(files: Files, folder: Path) -> None:
     assert read_rows(folder / "again.jsonl") == rows
 
 
+LOG_LINES = b"".join(b'{"step": %d, "loss": 0.5, "psnr": 17.25}\n' % step for step in (20, 40, 60))
+
+
+def read_training_log(files: Files, folder: Path) -> None:
+    """Rows that a run could go on after."""
+    write_files(files, folder)
+    assert all(isinstance(row["step"], int) for row in read_log(folder / LOG))
+
+
 CHECKPOINT_TARGETS = (
     Target("checkpoint", model_seeds, read_model, mend_model),
-    Target("state", state_seeds, read_state, lambda files: join(files, STATE)),
+    Target("state", state_seeds, read_state, mend_state),
+    Target("log", lambda: [{LOG: LOG_LINES}], read_training_log),
     Target("rows", lambda: [_row_files()], read_result_rows),
 )

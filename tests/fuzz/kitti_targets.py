@@ -62,16 +62,18 @@ def check_label(label: KittiLabel) -> None:
 
 
 def read_labels(files: Files, folder: Path) -> None:
-    """Both kinds of label files."""
+    """A label file of the detection or of the tracking set."""
+    if "tracking.txt" in files:
+        frames, problems = group_tracking_lines(files["tracking.txt"].decode(errors="replace"), name="0000.txt")
+        assert all("0000.txt line " in problem for problem in problems)
+        for line in (line for lines in frames.values() for line in lines):
+            with suppress(InputError):  # the other lines are read all the same
+                check_label(parse_label(line.rest, where=line.where))
+        return
     text = files["label.txt"].decode(errors="replace")
-    lines_of_frames, problems = group_tracking_lines(text, name="label_02/0000.txt")
-    assert all("label_02/0000.txt line " in problem for problem in problems)
-    for line in (line for lines in lines_of_frames.values() for line in lines):
-        with suppress(InputError):  # the other lines are read all the same
-            check_label(parse_label(line.rest, where=line.where))
-    for number, text_line in enumerate(text.split("\n"), start=1):
+    for number, line in enumerate(text.split("\n"), start=1):
         with suppress(InputError):
-            check_label(parse_label(text_line, where=f"label.txt line {number}"))
+            check_label(parse_label(line, where=f"label.txt line {number}"))
     for label in parse_labels(text, name="label.txt"):
         check_label(label)
 
@@ -107,7 +109,7 @@ def read_frame(files: Files, folder: Path) -> None:
 
 
 KITTI_TARGETS = (
-    Target("labels", lambda: [{"label.txt": LABELS}, {"label.txt": TRACKING}], read_labels),
+    Target("labels", lambda: [{"label.txt": LABELS}, {"tracking.txt": TRACKING}], read_labels),
     Target("calibration", lambda: [{"calib.txt": CALIBRATION}, {"calib.txt": SMALL_CALIBRATION}], read_calibration),
     Target("frame", frame_seeds, read_frame),
 )

@@ -83,7 +83,7 @@ def store_seeds() -> list[Files]:
 def assemble(files: Files, folder: Path) -> None:
     """Write a store; hostile rows get the pictures of the sound ones and a manifest that agrees."""
     sound = _store_files()
-    write_files({**{name: sound[name] for name in ("manifest.json", SHARD)}, **files}, folder)
+    write_files({**sound, **{name: data for name, data in files.items() if name in sound}}, folder)
     if ROWS not in files:
         return
     try:

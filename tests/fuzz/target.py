@@ -33,6 +33,7 @@ def is_refused(target: Target, files: Files, folder: Path) -> bool:
     """Read an input: True for an `InputError` with a message, False for a sound value; all else is a find."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
+        warnings.simplefilter("error", RuntimeWarning)  # numpy's, on numbers that run over
         try:
             target.read(files, folder)
         except InputError as error:

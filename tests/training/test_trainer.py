@@ -70,6 +70,14 @@ def test_a_run_resumed_after_its_end_is_done(store: PatchStore, tmp_path: Path) 
     assert before == {name: (tmp_path / name).read_bytes() for name in before}
 
 
+def test_a_run_resumed_beyond_its_new_end_has_a_model(store: PatchStore, tmp_path: Path) -> None:
+    """Stopped before its first checkpoint, then made shorter than what is done already."""
+    with pytest.raises(Interrupted):
+        train(TINY, store, tmp_path, device="cpu", should_stop=lambda: True)
+    summary = train(dataclasses.replace(TINY, steps=1), store, tmp_path, device="cpu", resume=True)
+    assert describe_model(tmp_path).provenance["step"] == summary.steps == 1
+
+
 def test_a_run_killed_before_its_first_checkpoint_starts_again(store: PatchStore, tmp_path: Path) -> None:
     """With or without --resume: there is a sign of it (the log, a lock nobody holds), and nothing to go on from."""
     train(TINY, store, tmp_path / "whole", device="cpu")
@@ -217,3 +225,24 @@ def test_bfloat16_learns_what_float32_learns(store: PatchStore, tmp_path: Path) 
         psnr[precision] = sum(curve[-10:]) / 10
         assert psnr[precision] > sum(curve[:5]) / 5 + 1.0
     assert abs(psnr["float32"] - psnr["bfloat16"]) < 0.5, psnr
+
+
+def test_a_flipped_bit_in_the_state_is_found(store: PatchStore, tmp_path: Path) -> None:
+    """The optimiser's numbers: a run going on from wrong ones would look well."""
+    train(TINY, store, tmp_path, device="cpu")
+    path = tmp_path / "training.safetensors"
+    data = bytearray(path.read_bytes())
+    data[-100] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="sha256 is not the one written with it"):
+        train(dataclasses.replace(TINY, steps=20), store, tmp_path, device="cpu", resume=True)
+
+
+def test_a_log_broken_in_the_middle_is_named_and_a_cut_end_is_not(tmp_path: Path) -> None:
+    path = tmp_path / "log.jsonl"
+    path.write_bytes(b'{"step": 1}\n{"step": 2}\n{"st')
+    assert [row["step"] for row in read_log(path)] == [1, 2]
+    for line in (b"\xff\xfe", b"[1]", b'{"step": "two"}', b"{"):
+        path.write_bytes(b'{"step": 1}\n' + line + b'\n{"step": 3}\n')
+        with pytest.raises(InputError, match="line 2"):
+            read_log(path)

@@ -9,28 +9,35 @@ import tyro
 from carstudio.commands.command import Outcome, Output, plain
 from carstudio.dataset.build import BuildConfig, build
 from carstudio.dataset.filters import FilterRecipe
+from carstudio.dataset.sources.frame import CameraOffset
 from carstudio.dataset.summary import BuildSummary
 from carstudio.dataset.writer import count_patches, shard_paths
+
+_SHOWN_PROBLEMS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
 class Build(Output):
     """Make a CarPatch3D store: crops, boxes, masks, cameras, and a verdict with its reason for every candidate."""
 
-    source: tyro.conf.Positional[Literal["kitti-det", "kitti-mot"]]
-    """Kind of input."""
+    source: tyro.conf.Positional[Literal["kitti-det", "kitti-mot", "legacy-json"]]
+    """Kind of input; legacy-json: CarPatch3D as the authors published it."""
     root: Path
-    """Folder of the source in its official layout."""
+    """Folder of the source in its official layout; legacy-json: a json file, or the folder with km.json, ko.json ..."""
     out: Path
     """The store to write."""
     frames: str | None = None
     """Frame numbers A-B, both included; all when absent."""
     sequence: str | None = None
     """KITTI-MOT: one sequence, such as 0001; all when absent."""
+    subset: str | None = None
+    """legacy-json: one of km, ko, dv, vk, ns; all that are there when absent."""
+    camera_offset: CameraOffset = "exact"
+    """exact: boxes are moved by K^-1 P2[:, 3], as KITTI's projection says; as-released: they are not."""
     segmenter: str = "grabcut"
     """grabcut (no weights), onnx:FILE (better on real frames), precomputed:FOLDER."""
     filters: tyro.conf.OmitArgPrefixes[FilterRecipe] = field(default_factory=FilterRecipe)
-    """Thresholds; the released ones by default."""
+    """Thresholds; the released ones by default. legacy-json takes none: `dataset refilter` judges it again."""
     workers: int = 0
     """Processes; 0: one per core. Changes nothing in the result."""
 
@@ -46,6 +53,8 @@ class Build(Output):
             out=self.out,
             frames=self.frames,
             sequence=self.sequence,
+            subset=self.subset,
+            camera_offset=self.camera_offset,
             segmenter=self.segmenter,
             filters=self.filters,
             workers=self.workers,
@@ -68,5 +77,7 @@ def describe(summary: BuildSummary) -> str:
     ]
     lines += [f"  {count:6d}  {reason}" for reason, count in summary.reasons.items()]
     lines += [f"  split {name}: {parts}" for name, parts in summary.splits.items()]
-    lines += [f"  problem: {problem}" for problem in summary.problems]
+    lines += [f"  problem: {problem}" for problem in summary.problems[:_SHOWN_PROBLEMS]]
+    if len(summary.problems) > _SHOWN_PROBLEMS:
+        lines.append(f"  ... and {len(summary.problems) - _SHOWN_PROBLEMS} more problems; --json lists them all")
     return "\n".join(lines)

@@ -15,7 +15,7 @@ from types import FrameType
 from carstudio.errors import Interrupted
 from carstudio.signals import STOP_SIGNALS
 
-GRACE_S = 0.75  # for unwinding, or for saving at a step's end; the rest of the second is for the goodbye
+GRACE_S = 0.6  # for unwinding, or saving at a step's end; the rest of the second: a goodbye, freeing gigabytes
 _SPEAKING_S = 0.2  # for the main thread, when it has begun to say goodbye
 _SHOW_CURSOR = "\x1b[?25h"  # progress bars hide it
 

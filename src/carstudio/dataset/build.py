@@ -8,52 +8,60 @@ import hashlib
 import json
 import os
 import time
+from collections.abc import Callable, Iterable
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from carstudio.dataset.candidates import FrameResult, records_of_frame
 from carstudio.dataset.filters import FilterRecipe, judge
+from carstudio.dataset.legacy_json.importer import KEEP_RELEASED, SOURCE, LegacyJob, open_legacy
 from carstudio.dataset.runs import is_made_already, write_run
-from carstudio.dataset.sources.frame import FrameRef, Source
+from carstudio.dataset.sources.frame import CameraOffset, FrameRef, Source
 from carstudio.dataset.sources.kitti_det import open_kitti_det
 from carstudio.dataset.sources.kitti_mot import open_kitti_mot
-from carstudio.dataset.splits import count_parts, write_splits
-from carstudio.dataset.store import PatchStore, StoreWriter, open_store
-from carstudio.dataset.summary import BuildSummary, count_reasons
-from carstudio.dataset.verdicts import Verdict
+from carstudio.dataset.splits import write_splits
+from carstudio.dataset.store import PARTS, PatchStore, StoreWriter, open_store
+from carstudio.dataset.summary import BuildSummary
 from carstudio.dataset.workers import ordered_map
 from carstudio.errors import InputError
+from carstudio.locks import clear_leftovers
 from carstudio.perception.results import Segmenter
 from carstudio.perception.specs import make_segmenter
 from carstudio.progress import Report, silent
 
 __all__ = ["BuildConfig", "BuildSummary", "build"]
 
-_CHUNK = 4  # frames handed to a process at once
+_FRAMES_PER_CHUNK = 4  # handed to a process at once
+_RECORDS_PER_CHUNK = 32  # of the authors' json: a fraction of a frame's work each
 
 
 @dataclass(frozen=True)
 class BuildConfig:
     """What to build from what."""
 
-    source: Literal["kitti-det", "kitti-mot"]
+    source: Literal["kitti-det", "kitti-mot", "legacy-json"]
     """Kind of input."""
     root: Path
-    """Folder of the source, in its official layout (the folder with image_2 or image_02, or its parent)."""
+    """Folder of the source, in its official layout (the folder with image_2 or image_02, or its parent); legacy-json:
+    one of the authors' json files, or the folder that holds them."""
     out: Path
     """Folder of the store; must be new, empty or an unfinished store."""
     frames: str | None = None
     """Frame numbers A-B, both included; all when absent."""
     sequence: str | None = None
     """KITTI-MOT: one sequence, such as 0001; all when absent."""
+    subset: str | None = None
+    """legacy-json: one of km, ko, dv, vk, ns; all that are there when absent."""
+    camera_offset: CameraOffset = "exact"
+    """exact: boxes are moved by K^-1 P2[:, 3], as KITTI's projection says; as-released: they are not."""
     segmenter: str = "grabcut"
     """grabcut (needs no weights), onnx:FILE (better on real frames), precomputed:FOLDER or ground-truth."""
     types: tuple[str, ...] = ("Car",)
     """Label types that become candidates; objects of every type hide those behind them."""
     filters: FilterRecipe = field(default_factory=FilterRecipe)
-    """Thresholds of the filters."""
+    """Thresholds of the filters; legacy-json keeps what the authors released, `dataset refilter` judges it again."""
     workers: int = 0
     """Processes; 0 takes one per core. Changes nothing in the result."""
 
@@ -82,60 +90,112 @@ class FrameJob:
             return FrameResult((), (f"frame {ref.stem} skipped: {error}",))
 
 
+@dataclass(frozen=True)
+class Plan:
+    """What a build works through, in order; `start` takes the ids of patches that are there already."""
+
+    source: str
+    num_items: int
+    start: Callable[[frozenset[str]], tuple[Callable[[Any], FrameResult], Iterable[Any]]]  # the work, the items left
+    chunk: int  # items handed to a process at once
+    filters: FilterRecipe
+    resume_key: str
+    problems: tuple[str, ...] = ()
+
+
 def build(config: BuildConfig, report: Report = silent) -> BuildSummary:
     """Make the store `config.out`; verdicts and splits are written at the end."""
     start = time.perf_counter()
     if is_made_already(config.out, asdict(config)):
-        store = open_store(config.out)
-        return summarize(store, source=config.source, verdicts=store.verdicts())
-    source = open_source(config)
-    segmenter = make_segmenter(config.segmenter)
-    refs = source.frames()
-    workers = _num_workers(config.workers, len(refs))
-    problems = list(source.problems)
-    with StoreWriter(config.out, source=source.name, resume_key=_resume_key(config)) as writer:
+        clear_leftovers(config.out)
+        return summarize(open_store(config.out), source=config.source)
+    plan = plan_legacy(config, report) if config.source == "legacy-json" else plan_frames(config)
+    workers = _num_workers(config.workers, plan.num_items // (2 * plan.chunk))
+    problems = list(plan.problems)
+    with StoreWriter(config.out, source=plan.source, resume_key=plan.resume_key) as writer:
         write_run(config.out, asdict(config))
-        job = FrameJob(source, segmenter, config.types, writer.ids())
-        with closing(ordered_map(job, refs, workers=workers, chunk=_CHUNK)) as results:
+        work, items = plan.start(writer.ids())
+        with closing(ordered_map(work, items, workers=workers, chunk=plan.chunk)) as results:
             for done, result in enumerate(results, start=1):
                 for record in result.records:
                     writer.append(record)
                 problems += result.problems
-                report("build", done, len(refs), f"{len(writer)} candidates")
-        verdicts = judge_and_split(writer, config.filters)
-    summary = summarize(open_store(config.out), source=source.name, verdicts=verdicts)
+                report("build", done, plan.num_items, f"{len(writer)} candidates")
+        judge_and_split(writer, plan.filters)
+    summary = summarize(open_store(config.out), source=plan.source)
     return replace(summary, problems=tuple(problems), seconds=time.perf_counter() - start)
 
 
+def plan_frames(config: BuildConfig) -> Plan:
+    """Photographs with labels: every frame is segmented."""
+    source = open_source(config)
+    segmenter = make_segmenter(config.segmenter)
+    refs = source.frames()
+    return Plan(
+        source=source.name,
+        num_items=len(refs),
+        start=lambda done: (FrameJob(source, segmenter, config.types, done), refs),
+        chunk=_FRAMES_PER_CHUNK,
+        filters=config.filters,
+        resume_key=_resume_key(config),
+        problems=source.problems,
+    )
+
+
+def plan_legacy(config: BuildConfig, report: Report = silent) -> Plan:
+    """The authors' records: nothing is segmented, everything is kept."""
+    for name, default in (("frames", None), ("sequence", None), ("segmenter", "grabcut"), ("types", ("Car",))):
+        if getattr(config, name) != default:
+            raise InputError(
+                f"--{name} is for sources with photographs; legacy-json takes patches and masks as they are"
+            )
+    if config.filters != FilterRecipe():
+        raise InputError(
+            "legacy-json keeps all that the authors released, no thresholds apply; build without them, then judge the "
+            "store again with `carstudio dataset refilter STORE` and the thresholds"
+        )
+    source = open_legacy(config.root, subset=config.subset, report=report)
+    return Plan(
+        source=SOURCE,
+        num_items=source.num_instances,
+        start=lambda done: (LegacyJob(source.folder, config.camera_offset), source.items(done)),
+        chunk=_RECORDS_PER_CHUNK,
+        filters=KEEP_RELEASED,
+        resume_key=_resume_key(config, *(file.sha256 for file in source.files)),
+    )
+
+
 def open_source(config: BuildConfig) -> Source:
-    """The source that the config names."""
+    """The photographs that the config names."""
+    if config.subset is not None:
+        raise InputError(f"--subset is for legacy-json; {config.source} has no subsets")
     if config.source == "kitti-det":
         if config.sequence is not None:
             raise InputError("--sequence is for kitti-mot; kitti-det has no sequences")
-        return open_kitti_det(config.root, frames=config.frames)
-    return open_kitti_mot(config.root, sequence=config.sequence, frames=config.frames)
+        return open_kitti_det(config.root, frames=config.frames, camera_offset=config.camera_offset)
+    assert config.source == "kitti-mot", config.source
+    return open_kitti_mot(
+        config.root, sequence=config.sequence, frames=config.frames, camera_offset=config.camera_offset
+    )
 
 
-def judge_and_split(writer: StoreWriter, recipe: FilterRecipe) -> list[Verdict]:
+def judge_and_split(writer: StoreWriter, recipe: FilterRecipe) -> None:
     """Verdicts and splits of all that was written: before the writer closes, so that "finished" comes last.
 
     A run killed before that is unfinished and goes on when it is started again.
     """
     writer.flush()
     store = open_store(writer.path, lock=writer.lock)
-    verdicts = judge_store(store, recipe)
+    judge_store(store, recipe)
     write_splits(store)
-    return verdicts
 
 
-def judge_store(store: PatchStore, recipe: FilterRecipe) -> list[Verdict]:
+def judge_store(store: PatchStore, recipe: FilterRecipe) -> None:
     """Judge every patch again by its stored values and replace the store's verdicts."""
-    verdicts = [judge(record, recipe) for record in store.light_records()]
-    store.write_verdicts(verdicts)
-    return verdicts
+    store.write_verdicts(judge(record, recipe) for record in store.light_records())
 
 
-def summarize(store: PatchStore, *, source: str, verdicts: list[Verdict]) -> BuildSummary:
+def summarize(store: PatchStore, *, source: str) -> BuildSummary:
     """Count everything in a finished store."""
     info = store.info()
     return BuildSummary(
@@ -144,18 +204,18 @@ def summarize(store: PatchStore, *, source: str, verdicts: list[Verdict]) -> Bui
         candidates=len(store),
         kept=info["kept"],
         instances=info["kept_instances"],
-        reasons=count_reasons(verdicts),
-        splits={name: count_parts(store.split(name)) for name in store.split_names()},
+        reasons=info["reasons"],
+        splits={name: {part: parts.get(part, 0) for part in PARTS} for name, parts in info["splits"].items()},
     )
 
 
-def _resume_key(config: BuildConfig) -> str:
+def _resume_key(config: BuildConfig, *inputs: str) -> str:
     """What must be equal for an interrupted build to go on: all that decides the records."""
     settings = {key: value for key, value in asdict(config).items() if key not in ("out", "filters", "workers", "root")}
-    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps([settings, inputs], sort_keys=True).encode()).hexdigest()
 
 
-def _num_workers(workers: int, num_frames: int) -> int:
+def _num_workers(workers: int, most: int) -> int:
     if workers < 0:
         raise InputError(f"--workers must be 0 (one per core) or more, found {workers}")
-    return min(workers or os.cpu_count() or 1, max(1, num_frames // 8))  # a process takes seconds to start
+    return min(workers or os.cpu_count() or 1, max(1, most))  # a process takes seconds to start

@@ -147,7 +147,7 @@ def _record(
         score_mask=None if result.score is None else round(result.score, 6),
         score_3d=thing.score_3d,
         mask_ratio=float(result.car.mean()),
-        box_iou=_envelope_iou(thing, camera),
+        box_iou=envelope_iou(object_box(thing), camera, thing.box2d),
         truncation=thing.truncation,
         occlusion=thing.occlusion,
         licence=licence,
@@ -178,13 +178,13 @@ def mask_pixels(result: MaskResult) -> UInt8[np.ndarray, "height width"]:
     return mask
 
 
-def _envelope_iou(thing: LabelledObject, camera: Camera) -> float | None:
-    box = object_box(thing)
+def envelope_iou(box: Box3D | None, camera: Camera, box2d: tuple[float, float, float, float]) -> float | None:
+    """IoU of a 2-D box with the envelope of the projected 3-D box, both in the photograph; None without a 3-D box."""
     if box is None:
         return None
     outline = envelope(box, camera)
     if outline is None:
         return 0.0
-    iou = float(box2d_iou(outline, torch.tensor(thing.box2d, dtype=torch.float64)))
+    iou = float(box2d_iou(outline, torch.tensor(box2d, dtype=torch.float64)))
     assert math.isfinite(iou)
     return round(iou, 6)

@@ -39,8 +39,8 @@ class PatchRecord:
     mask: bytes | None = None  # PNG with the values of `MaskValue`, same size
     depth: bytes | None = None  # 16-bit PNG, metres * 256, same size
     frame_path: str
-    frame_width: int
-    frame_height: int
+    frame_width: int | None  # px; None where the source does not tell the photograph's size
+    frame_height: int | None
     crop_x0: int
     crop_y0: int
     crop_width: int
@@ -69,8 +69,10 @@ class PatchRecord:
 
     @property
     def frame_camera(self) -> Camera:
-        """Camera of the full frame, float32."""
-        return Camera(torch.tensor([self.fx, self.fy, self.cx, self.cy]), self.frame_width, self.frame_height)
+        """Camera of the full frame, float32; a frame of unknown size ends where the crop does."""
+        width = self.crop_x0 + self.crop_width if self.frame_width is None else self.frame_width
+        height = self.crop_y0 + self.crop_height if self.frame_height is None else self.frame_height
+        return Camera(torch.tensor([self.fx, self.fy, self.cx, self.cy]), width, height)
 
     @property
     def box(self) -> Box3D | None:

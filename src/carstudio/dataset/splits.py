@@ -21,7 +21,7 @@ TEST_FRACTION = 0.1  # of the cars, to match it
 VIEW_TRAIN_FRACTION = 2 / 3  # of a car's views in time order
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class View:
     """What a split needs to know of a patch. `order`: position in time among the views of its instance."""
 
@@ -72,24 +72,27 @@ def split_as_released(views: Sequence[View]) -> Parts:
 def write_splits(store: "PatchStore") -> dict[str, dict[str, int]]:
     """Write the three splits over the store's kept patches; returns name -> {"train": n, "test": n}."""
     views = kept_views(store)
-    splits = {
-        "instance": split_by_instance(views),
-        "view": split_by_view(views),
-        "released-patch": split_as_released(views),
-    }
-    for name, parts in splits.items():
+    counts = {}
+    for name, split in (
+        ("instance", split_by_instance),
+        ("view", split_by_view),
+        ("released-patch", split_as_released),
+    ):
+        parts = split(views)
         store.write_split(name, parts)
-    return {name: count_parts(parts) for name, parts in splits.items()}
+        counts[name] = count_parts(parts)
+    return counts
 
 
 def kept_views(store: "PatchStore") -> list[View]:
     """The kept patches in store order; time order is the frame index where there is one, else the store's."""
     kept = set(store.patch_ids())
-    rows = store.table(["patch_id", "instance_id", "frame_index"]).to_pylist()
+    table = store.table(["patch_id", "instance_id", "frame_index"])
+    rows = zip(*(table[name].to_pylist() for name in table.column_names), strict=True)
     return [
-        View(row["patch_id"], row["instance_id"], rank if row["frame_index"] is None else row["frame_index"])
-        for rank, row in enumerate(rows)
-        if row["patch_id"] in kept
+        View(patch_id, instance_id, rank if frame_index is None else frame_index)
+        for rank, (patch_id, instance_id, frame_index) in enumerate(rows)
+        if patch_id in kept
     ]
 
 

@@ -7,24 +7,29 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property, lru_cache
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from carstudio.dataset.manifest import Manifest, data_sha256, read_manifest
 from carstudio.dataset.patch import Patch, PatchRecord
+from carstudio.dataset.reading import reading
 from carstudio.dataset.schema import LIGHT_COLUMNS, PICTURES, SCHEMA, check_id, record_from_row
-from carstudio.dataset.verdicts import Verdict, table_from_verdicts, verdicts_from_table
+from carstudio.dataset.summary import sort_reasons
+from carstudio.dataset.verdicts import VERDICT_SCHEMA, Verdict, table_from_verdicts, verdicts_from_table
 from carstudio.dataset.verify import verify_store
-from carstudio.dataset.writer import StoreWriter, describe_shard, shard_paths, write_table
+from carstudio.dataset.writer import StoreWriter, describe_shard, shard_paths, write_tables
 from carstudio.errors import InputError
 from carstudio.locks import FolderLock
 
 __all__ = ["PatchStore", "StoreWriter", "open_store"]
 
 PARTS = ("train", "test")
+_VERDICTS_PER_GROUP = 4096
 _CACHED_GROUPS = 2  # row groups whose pictures are kept, so that reading in order decodes each group once
 
 
@@ -84,13 +89,19 @@ class PatchStore:
             raise InputError(f"{self.path}: no column {unknown}; there are {self._files[0].schema_arrow.names}")
         if not self._files:
             return SCHEMA.empty_table().select(columns)
-        return pa.concat_tables([file.read(columns=columns) for file in self._files])
+        with reading(self.path / "data"):
+            return _validated(pa.concat_tables([file.read(columns=columns) for file in self._files]))
 
     @cached_property
     def _locations(self) -> dict[str, Location]:
         locations: dict[str, Location] = {}
         for shard, file in enumerate(self._files):
-            ids = file.read(columns=["patch_id"])["patch_id"].to_pylist()
+            path = shard_paths(self.path)[shard]
+            with reading(path):
+                ids = _validated(file.read(columns=["patch_id"]))["patch_id"].to_pylist()
+            counts = [file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)]
+            if sum(counts) != len(ids):
+                raise InputError(f"{path}: its row groups tell of {sum(counts)} patches, found {len(ids)}; restore it")
             start = 0
             for group in range(file.num_row_groups):
                 stop = start + file.metadata.row_group(group).num_rows
@@ -106,7 +117,7 @@ class PatchStore:
             raise InputError(f"part {part!r} needs the name of a split; this store has {self.split_names()}")
         ids: Iterable[str] = self._locations
         if kept:
-            rejected = {verdict.patch_id for verdict in self.verdicts() if not verdict.is_kept}
+            rejected = set(self._rejected().to_pylist())
             ids = (patch_id for patch_id in ids if patch_id not in rejected)
         if split is not None:
             parts = self.split(split)
@@ -115,10 +126,14 @@ class PatchStore:
         return list(ids)
 
     def _read_pictures(self, shard: int, group: int) -> pa.Table:
-        return self._files[shard].read_row_group(group, columns=list(PICTURES), use_threads=False)
+        return self._read_group(shard, group, PICTURES)
 
     def _read_light(self, shard: int, group: int) -> pa.Table:
-        return self._files[shard].read_row_group(group, columns=list(LIGHT_COLUMNS), use_threads=False)
+        return self._read_group(shard, group, LIGHT_COLUMNS)
+
+    def _read_group(self, shard: int, group: int, columns: Iterable[str]) -> pa.Table:
+        with reading(shard_paths(self.path)[shard]):
+            return _validated(self._files[shard].read_row_group(group, columns=list(columns), use_threads=False))
 
     def record(self, patch_id: str) -> PatchRecord:
         """One patch as stored."""
@@ -133,8 +148,14 @@ class PatchStore:
 
     def light_records(self) -> Iterator[PatchRecord]:
         """All candidates in store order without their pictures (`image` is empty): for filters."""
-        for batch in self.table().to_batches(max_chunksize=4096):
-            yield from map(record_from_row, batch.to_pylist())
+        for file in self._files:
+            yield from map(record_from_row, file.read(columns=list(LIGHT_COLUMNS)).to_pylist())
+
+    def records(self) -> Iterator[PatchRecord]:
+        """All candidates in store order, kept or not, with their pictures; one row group is in memory at a time."""
+        for file in self._files:
+            for group in range(file.num_row_groups):
+                yield from map(record_from_row, file.read_row_group(group, use_threads=False).to_pylist())
 
     def patch(self, patch_id: str) -> Patch:
         """One patch decoded."""
@@ -145,12 +166,31 @@ class PatchStore:
         path = self.path / "verdicts.parquet"
         return verdicts_from_table(_read_side_table(path)) if path.is_file() else []
 
+    def verdict_columns(self, *names: str) -> pa.Table:
+        """Some columns of the verdicts, without the checks a fraction of their memory."""
+        path = self.path / "verdicts.parquet"
+        if not path.is_file():
+            return VERDICT_SCHEMA.empty_table().select(names)
+        return _read_side_table(path, list(names))
+
+    def _rejected(self) -> pa.ChunkedArray:
+        table = self.verdict_columns("patch_id", "is_kept")
+        return table.filter(pc.invert(table["is_kept"]))["patch_id"]
+
     def write_verdicts(self, verdicts: Iterable[Verdict]) -> None:
-        """Replace the verdicts; `InputError` when one is about a patch that is not in the store."""
-        verdicts = list(verdicts)
-        self._check_known((verdict.patch_id for verdict in verdicts), "verdicts")
+        """Replace the verdicts; `InputError` when one is about a patch that is not in the store.
+
+        They are taken one by one and written in row groups: those of half a million patches need not be in memory.
+        """
+
+        def tables() -> Iterator[pa.Table]:
+            left = iter(verdicts)
+            while some := list(islice(left, _VERDICTS_PER_GROUP)):
+                self._check_known((verdict.patch_id for verdict in some), "verdicts")
+                yield table_from_verdicts(some)
+
         with self._writing():
-            write_table(self.path / "verdicts.parquet", table_from_verdicts(verdicts))
+            write_tables(self.path / "verdicts.parquet", VERDICT_SCHEMA, tables())
 
     def split_names(self) -> list[str]:
         """Names of the splits this store has."""
@@ -158,11 +198,14 @@ class PatchStore:
 
     def split(self, name: str) -> dict[str, str]:
         """patch_id -> "train" or "test"."""
+        table = self._split_table(name)
+        return dict(zip(table["patch_id"].to_pylist(), table["part"].to_pylist(), strict=True))
+
+    def _split_table(self, name: str) -> pa.Table:
         path = self.path / "splits" / f"{check_id(name, 'split name')}.parquet"
         if not path.is_file():
             raise InputError(f"{self.path}: no split {name!r}; there are {self.split_names()}")
-        table = _read_side_table(path)
-        return dict(zip(table["patch_id"].to_pylist(), table["part"].to_pylist(), strict=True))
+        return _read_side_table(path)
 
     def write_split(self, name: str, parts: Mapping[str, str]) -> None:
         """Write split `name` (patch_id -> "train" or "test"), in store order."""
@@ -172,7 +215,7 @@ class PatchStore:
         ids = [patch_id for patch_id in self._locations if patch_id in parts]
         table = pa.table({"patch_id": ids, "part": [parts[patch_id] for patch_id in ids]}, schema=_SPLIT_SCHEMA)
         with self._writing():
-            write_table(self.path / "splits" / f"{name}.parquet", table)
+            write_tables(self.path / "splits" / f"{name}.parquet", _SPLIT_SCHEMA, [table])
 
     def _writing(self) -> AbstractContextManager[object]:
         """The store's lock, taken for one write unless its holder opened this store."""
@@ -192,10 +235,11 @@ class PatchStore:
     def info(self) -> dict[str, Any]:
         """Counts: patches, instances, per source, per verdict reason, splits, sizes."""
         table = self.table(["patch_id", "instance_id", "source", "licence", "crop_height"])
-        verdicts = self.verdicts()
-        kept = set(self.patch_ids())
-        instances = zip(table["patch_id"].to_pylist(), table["instance_id"].to_pylist(), strict=True)
-        heights = Counter(32 * (height // 32) for height in table["crop_height"].to_pylist())
+        reasons = _counts(self.verdict_columns("reason")["reason"])
+        kept = table.filter(pc.invert(pc.is_in(table["patch_id"], self._rejected().combine_chunks())))
+        heights: Counter[int] = Counter()
+        for height, count in _counts(table["crop_height"]).items():
+            heights[32 * (height // 32)] += count
         return {
             "path": str(self.path),
             "format_version": self.manifest.format_version,
@@ -203,13 +247,15 @@ class PatchStore:
             "data_sha256": self.data_sha256,
             "patches": len(self),
             "kept": len(kept),
-            "instances": len(set(table["instance_id"].to_pylist())),
-            "kept_instances": len({instance for patch_id, instance in instances if patch_id in kept}),
-            "sources": dict(sorted(Counter(table["source"].to_pylist()).items())),
-            "licences": dict(sorted(Counter(table["licence"].to_pylist()).items())),
-            "reasons": dict(Counter(verdict.reason for verdict in verdicts).most_common()),
-            "unjudged": len(self) - len(verdicts),
-            "splits": {name: dict(sorted(Counter(self.split(name).values()).items())) for name in self.split_names()},
+            "instances": pc.count_distinct(table["instance_id"]).as_py(),
+            "kept_instances": pc.count_distinct(kept["instance_id"]).as_py(),
+            "sources": dict(sorted(_counts(table["source"]).items())),
+            "licences": dict(sorted(_counts(table["licence"]).items())),
+            "reasons": sort_reasons(reasons),
+            "unjudged": len(self) - sum(reasons.values()),
+            "splits": {
+                name: dict(sorted(_counts(self._split_table(name)["part"]).items())) for name in self.split_names()
+            },
             "crop_height_px": {f"{low}-{low + 31}": heights[low] for low in sorted(heights)},
         }
 
@@ -219,15 +265,30 @@ _SPLIT_SCHEMA = pa.schema(
 )
 
 
+def _validated(table: pa.Table) -> pa.Table:
+    """The table, its text checked to be UTF-8 and its offsets to lie in its buffers (ArrowInvalid otherwise)."""
+    table.validate(full=True)
+    return table
+
+
 def _open_shard(path: Path) -> pq.ParquetFile:
-    try:
-        return pq.ParquetFile(path, memory_map=True)
-    except (pa.ArrowException, OSError) as error:
-        raise InputError(f"{path}: expected a Parquet file, found something else ({error}); restore it") from error
+    with reading(path):
+        file = pq.ParquetFile(path, memory_map=True)
+        found = {field.name: field.type for field in file.schema_arrow}
+    for field in SCHEMA:
+        if found.get(field.name) != field.type:
+            raise InputError(
+                f"{path}: column {field.name!r} must be {field.type}, found {found.get(field.name, 'none')}; "
+                "it is no shard of a CarPatch3D store, or a damaged one"
+            )
+    return file
 
 
-def _read_side_table(path: Path) -> pa.Table:
-    try:
-        return pq.read_table(path)
-    except (pa.ArrowException, OSError) as error:
-        raise InputError(f"{path}: expected a Parquet file, found something else ({error}); restore it") from error
+def _counts(column: pa.ChunkedArray) -> dict[Any, int]:
+    """How often each value occurs."""
+    return {row["values"]: row["counts"] for row in pc.value_counts(column).to_pylist()}
+
+
+def _read_side_table(path: Path, columns: list[str] | None = None) -> pa.Table:
+    with reading(path):
+        return pq.read_table(path, columns=columns)

@@ -1,11 +1,8 @@
 """What a build did, in numbers."""
 
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-
-from carstudio.dataset.verdicts import Verdict
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +20,6 @@ class BuildSummary:
     seconds: float = 0.0
 
 
-def count_reasons(verdicts: Sequence[Verdict]) -> dict[str, int]:
+def sort_reasons(counts: Mapping[str, int]) -> dict[str, int]:
     """Patches per reason, "kept" first, then the most frequent."""
-    counts = Counter(verdict.reason for verdict in verdicts)
     return dict(sorted(counts.items(), key=lambda item: (item[0] != "kept", -item[1], item[0])))

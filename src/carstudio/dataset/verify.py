@@ -22,12 +22,12 @@ def verify_store(store: "PatchStore") -> list[str]:
     problems = list(_shard_problems(store))
     if problems:
         return problems
-    for patch_id in store.patch_ids(kept=False):
-        problems += [f"patch {patch_id}: {problem}" for problem in record_problems(store.record(patch_id))]
+    for record in store.records():
+        problems += [f"patch {record.patch_id}: {problem}" for problem in record_problems(record)]
     known = set(store.patch_ids(kept=False))
-    for verdict in store.verdicts():
-        if verdict.patch_id not in known:
-            problems.append(f"verdicts.parquet: patch {verdict.patch_id} is not in the store")
+    for patch_id in store.verdict_columns("patch_id")["patch_id"].to_pylist():
+        if patch_id not in known:
+            problems.append(f"verdicts.parquet: patch {patch_id} is not in the store")
     for name in store.split_names():
         unknown = store.split(name).keys() - known
         problems += [f"splits/{name}.parquet: patch {patch_id} is not in the store" for patch_id in sorted(unknown)]

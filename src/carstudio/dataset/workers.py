@@ -9,10 +9,11 @@ import os
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from itertools import islice
 from multiprocessing import connection, resource_tracker
 from typing import TypeVar
 
@@ -27,20 +28,21 @@ Result = TypeVar("Result")
 
 
 def ordered_map(
-    work: Callable[[Item], Result], items: Sequence[Item], *, workers: int, chunk: int = 1
+    work: Callable[[Item], Result], items: Iterable[Item], *, workers: int, chunk: int = 1
 ) -> Generator[Result, None, None]:
     """`map(work, items)` on several processes, `chunk` items at a time; both `work` and its results get pickled.
 
+    Items are taken as they are needed: they need not all be in memory.
     With one worker all is done in this process. Close the iterator (`contextlib.closing`) to end the workers at once.
     """
     if workers <= 1:
         yield from map(work, items)
         return
-    chunks = [items[i : i + chunk] for i in range(0, len(items), chunk)]
+    left = iter(items)
     try:
         with _pool(workers) as pool:
             waiting: deque[Future[list[Result]]] = deque()
-            for some in chunks:
+            while some := list(islice(left, chunk)):
                 waiting.append(_submit(pool, work, some))
                 if len(waiting) > 2 * workers:  # keeps memory bounded
                     yield from waiting.popleft().result()
@@ -56,7 +58,7 @@ def ordered_map(
 @contextmanager
 def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     context = multiprocessing.get_context("spawn")  # torch and onnxruntime have threads: forking them is not safe
-    resource_tracker.ensure_running()  # its start unblocks signals, which must not happen while a worker starts
+    _start_tracker()
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin)
     try:
@@ -67,6 +69,23 @@ def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
             worker.kill()  # leaving the pool's own `with` block would wait for everything that was handed out
         pool.shutdown(wait=False, cancel_futures=True)
         raise
+
+
+def _start_tracker() -> None:
+    """Start what removes the semaphores of a process that ends without doing so itself, and tell it to keep quiet.
+
+    It starts here because its start unblocks signals, which must not happen while a worker starts.
+    """
+    before = os.environ.get("PYTHONWARNINGS")
+    quiet = "ignore::UserWarning:multiprocessing.resource_tracker"
+    os.environ["PYTHONWARNINGS"] = f"{before},{quiet}" if before else quiet
+    try:
+        resource_tracker.ensure_running()
+    finally:
+        if before is None:
+            del os.environ["PYTHONWARNINGS"]
+        else:
+            os.environ["PYTHONWARNINGS"] = before
 
 
 def _submit(pool: ProcessPoolExecutor, work: Callable[[Item], Result], items: Sequence[Item]) -> Future[list[Result]]:

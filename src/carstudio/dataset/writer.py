@@ -4,7 +4,7 @@ A shard is written to a temporary file and renamed when it is complete. The mani
 from the first moment to `close`; a store cut off in between opens with the shards that are there.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -14,6 +14,7 @@ import pyarrow.parquet as pq
 
 from carstudio.dataset.manifest import Manifest, Shard, read_manifest, write_manifest
 from carstudio.dataset.patch import PatchRecord
+from carstudio.dataset.reading import reading
 from carstudio.dataset.schema import PICTURES, SCHEMA, check_id, table_from_records
 from carstudio.errors import InputError
 from carstudio.files import atomic_path, is_partial, remove_partials, sha256_file
@@ -36,10 +37,11 @@ _SMALL_LEAVES = [leaf for leaf in _LEAVES if not leaf.endswith(".bytes")]
 _COMPRESSION = {leaf: "zstd" if leaf in _SMALL_LEAVES else "none" for leaf in _LEAVES}
 
 
-def write_table(path: Path, table: pa.Table) -> None:
-    """Write a small side table (verdicts, a split) atomically."""
-    with atomic_path(path) as partial:
-        pq.write_table(table, partial, compression="zstd")
+def write_tables(path: Path, schema: pa.Schema, tables: Iterable[pa.Table]) -> None:
+    """Write a side table (verdicts, a split) atomically, a row group for each of `tables`, taken as they come."""
+    with atomic_path(path) as partial, pq.ParquetWriter(partial, schema, compression="zstd") as writer:
+        for table in tables:
+            writer.write_table(table)
 
 
 def shard_paths(folder: Path) -> list[Path]:
@@ -202,10 +204,12 @@ def describe_shard(path: Path) -> Shard:
 
 def count_patches(shard: Path) -> int:
     """Patches in a shard on disk, from its last bytes."""
-    num_rows: int = pq.read_metadata(shard).num_rows
-    return num_rows
+    with reading(shard):
+        num_rows: int = pq.read_metadata(shard).num_rows
+        return num_rows
 
 
 def _patch_ids(shard: Path) -> list[str]:
-    ids: list[str] = pq.read_table(shard, columns=["patch_id"])["patch_id"].to_pylist()
-    return ids
+    with reading(shard):
+        ids: list[str] = pq.read_table(shard, columns=["patch_id"])["patch_id"].to_pylist()
+        return ids

@@ -5,7 +5,7 @@ its own so that pandas, DuckDB and `jq` read the rows as they are.
 """
 
 import json
-import math
+import sys
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any
 
 from carstudio import __version__
 from carstudio.errors import InputError
-from carstudio.files import read_json, write_json, write_text
+from carstudio.files import parse_json, read_json, write_json, write_text
 
 METRICS = ("psnr", "psnr_mask", "ssim", "ssim_mask", "lpips", "mask_iou")
 METRIC_DEFINITION = (
@@ -100,10 +100,7 @@ def read_rows(path: Path | str) -> list[ResultRow]:
 
 
 def _row(line: str, where: str) -> ResultRow:
-    try:
-        value = json.loads(line)
-    except json.JSONDecodeError as error:
-        raise InputError(f"{where}: expected a JSON object, found {line[:60]!r} ({error})") from error
+    value = parse_json(line, name=where)
     if not isinstance(value, dict):
         raise InputError(f"{where}: expected a JSON object, found {line[:60]!r}")
     known = [item.name for item in fields(ResultRow)]
@@ -124,6 +121,6 @@ def _checked(name: str, value: Any, where: str) -> Any:
         return value
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
         raise InputError(f"{where}: {name} must be a finite number or null, found {value!r}")
     return float(value)

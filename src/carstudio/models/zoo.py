@@ -30,10 +30,10 @@ def config_to_json(config: ModelConfig) -> dict[str, Any]:
 
 def config_from_json(value: Any, *, name: str) -> ModelConfig:
     """Inverse of `config_to_json`; `InputError` naming the file for unknown kinds, unknown fields and wrong types."""
-    if not isinstance(value, dict) or value.get("kind") not in MODELS:
-        kind = value.get("kind") if isinstance(value, dict) else value
+    kind = value.get("kind") if isinstance(value, dict) else value
+    if not isinstance(kind, str) or kind not in MODELS:
         raise InputError(f"{name}: model kind must be one of {sorted(MODELS)}, found {kind!r}")
-    config_class, _ = MODELS[value["kind"]]
+    config_class, _ = MODELS[kind]
     fields = {key: field for key, field in value.items() if key != "kind"}
     return parse_dataclass(config_class, fields, name=name)
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 
-from carstudio.errors import InputError, StorageError
-from carstudio.files import atomic_path, read_json, sha256_file, write_json
+from carstudio.errors import InputError
+from carstudio.files import read_json, sha256_file, write_bytes, write_json
 from carstudio.models.interface import CategoryModel
 from carstudio.models.zoo import ModelConfig, build_model, config_from_json, config_to_json
 
@@ -47,11 +47,8 @@ def save_model(folder: Path, model: CategoryModel, config: ModelConfig, provenan
 def save_tensors(path: Path, tensors: dict[str, torch.Tensor], metadata: dict[str, str] | None = None) -> None:
     """Write tensors as safetensors, atomically."""
     on_cpu = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    with atomic_path(path) as partial:
-        try:
-            save_file(on_cpu, partial, metadata=metadata)
-        except SafetensorError as error:  # it wraps what the system says
-            raise StorageError(path, error) from error
+    # Not safetensors' own `save_file`: it writes to a temporary name of its own, which a kill leaves behind.
+    write_bytes(path, save(on_cpu, metadata=metadata))
 
 
 def load_tensors(path: Path) -> dict[str, torch.Tensor]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from carstudio.errors import InputError, StorageError
-from carstudio.files import write_text
+from carstudio.files import parse_json, write_text
 
 LOG = "log.jsonl"
 
@@ -64,13 +64,21 @@ def _summary_writer(folder: Path, resume_step: int) -> Any:
 
 def read_log(path: Path) -> list[dict[str, Any]]:
     """Rows of a log; a last line that a kill cut short is dropped, any other broken line is an `InputError`."""
-    lines = path.read_text(encoding="utf-8").splitlines()
+    lines = path.read_bytes().split(b"\n")
     rows = []
     for number, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
         try:
-            rows.append(json.loads(line))
-        except json.JSONDecodeError as error:
-            if number == len(lines):
-                break
-            raise InputError(f"{path} line {number}: expected a JSON object, found {line[:60]!r}") from error
+            rows.append(_row(line, f"{path} line {number}"))
+        except InputError:
+            if number < len(lines):  # a whole line ends with a line break, so that one more, empty, comes after it
+                raise
     return rows
+
+
+def _row(line: bytes, where: str) -> dict[str, Any]:
+    row = parse_json(line, name=where)
+    if not isinstance(row, dict) or isinstance(row.get("step"), bool) or not isinstance(row.get("step"), int):
+        raise InputError(f"{where}: expected a JSON object with a step, found {line[:60].decode(errors='replace')!r}")
+    return row

@@ -1,5 +1,6 @@
 """The state a run resumes from: weights, optimiser, step and time, in one safetensors file (one atomic write)."""
 
+import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,6 +44,11 @@ class TrainingState:
             for key, value in self.tensors.items():
                 slot = key.removeprefix(prefix)
                 if slot != key and "." not in slot:
+                    if value.shape not in (parameter.shape, ()):
+                        raise InputError(
+                            f"{STATE}: {key} has shape {list(value.shape)}, expected {list(parameter.shape)}; "
+                            "it belongs to another model"
+                        )
                     on = "cpu" if slot == "step" else parameter.device
                     optimizer.state[parameter][slot] = value.to(on)
 
@@ -50,6 +56,7 @@ class TrainingState:
 def save_state(folder: Path, state: TrainingState) -> None:
     """Write the state atomically."""
     metadata = {"step": json.dumps(state.step), "seconds": json.dumps(state.seconds), "starts_from": state.starts_from}
+    metadata["sha256"] = checksum(state.tensors, metadata)
     save_tensors(folder / STATE, state.tensors, metadata)
 
 
@@ -72,9 +79,25 @@ def load_state(folder: Path) -> TrainingState:
     tensors = load_tensors(path)
     with safe_open(path, "pt") as file:
         metadata = file.metadata() or {}
+    told = metadata.pop("sha256", None)
+    if told != checksum(tensors, metadata):
+        raise InputError(
+            f"{path}: sha256 is not the one written with it ({told}): the file was damaged or changed; copy it "
+            "again, or train again in another folder"
+        )
     try:
         return TrainingState(
             tensors, int(metadata["step"]), float(metadata["seconds"]), metadata.get("starts_from", "")
         )
     except (KeyError, ValueError) as error:
         raise InputError(f"{path}: header lacks step or seconds ({error}); it is no training state") from error
+
+
+def checksum(tensors: dict[str, Tensor], metadata: dict[str, str]) -> str:
+    """Of names, types, shapes and bytes: a flipped bit in the optimiser's state would go unseen for ever."""
+    digest = hashlib.sha256(json.dumps(metadata, sort_keys=True).encode())
+    for name in sorted(tensors):
+        tensor = tensors[name].detach().cpu().contiguous()
+        digest.update(f"{name} {tensor.dtype} {list(tensor.shape)}".encode())
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()

@@ -253,8 +253,8 @@ class _Run:
             raise FloatingPointError(
                 f"step {self.step}: loss term {broken[0]} is {figures[broken[0]]} for cars {list(instance_ids)}; "
                 f"the weights are not changed by it. The last checkpoint in {self.out} is sound, but going on from it "
-                "meets the same numbers again: resume with another --seed (other batches from there on), or start "
-                "with a lower learning rate or clipped gradients (recipes.py)"
+                "meets the same numbers again: --resume with a lower --learning-rate, or with another --seed (other "
+                "batches from there on)"
             )
 
     def log(self, figures: dict[str, float]) -> None:

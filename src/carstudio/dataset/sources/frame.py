@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from carstudio.errors import InputError
 
 Vector3 = tuple[float, float, float]
+# "exact" adds K^-1 P2[:, 3] to the labels' boxes; "as-released" leaves it out, for comparing with the released code
+CameraOffset = Literal["exact", "as-released"]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from carstudio.dataset.sources.frame import Frame, FrameRef, LabelledObject, parse_frame_range
+from carstudio.dataset.sources.frame import CameraOffset, Frame, FrameRef, LabelledObject, parse_frame_range
 from carstudio.dataset.sources.kitti_format import (
     DONT_CARE,
     KITTI_LICENCE,
@@ -33,6 +33,7 @@ class KittiDetSource:
     name: str = "kitti-det"
     licence: str = KITTI_LICENCE
     problems: tuple[str, ...] = ()
+    camera_offset: CameraOffset = "exact"
 
     def frames(self) -> Sequence[FrameRef]:
         """The frames asked for, by number."""
@@ -43,7 +44,9 @@ class KittiDetSource:
         image = find_image(self.folder / "image_2", ref.stem)
         label_path, calib_path = self.folder / "label_2" / f"{ref.stem}.txt", self.folder / "calib" / f"{ref.stem}.txt"
         labels = parse_labels(read_text(label_path, "label file"), name=label_path.name)
-        calibration = parse_calibration(read_text(calib_path, "calibration"), name=f"calib/{calib_path.name}")
+        calibration = parse_calibration(
+            read_text(calib_path, "calibration"), name=f"calib/{calib_path.name}", camera_offset=self.camera_offset
+        )
         objects = [
             labelled_object(label, calibration, patch_id=f"ko-{ref.stem}-{number:03d}", extra={"line": number})
             for number, label in enumerate(labels)
@@ -60,11 +63,11 @@ class KittiDetSource:
         )
 
 
-def open_kitti_det(root: Path, *, frames: str | None = None) -> KittiDetSource:
+def open_kitti_det(root: Path, *, frames: str | None = None, camera_offset: CameraOffset = "exact") -> KittiDetSource:
     """The frames with an image; `InputError` when there are none."""
     folder = find_layout(root, "image_2", "image_2, label_2, calib")
     refs = list_frames(folder / "image_2", frames)
-    return KittiDetSource(folder, require_frames(refs, folder / "image_2", frames))
+    return KittiDetSource(folder, require_frames(refs, folder / "image_2", frames), camera_offset=camera_offset)
 
 
 def list_frames(folder: Path, frames: str | None, sequence_id: str | None = None) -> tuple[FrameRef, ...]:

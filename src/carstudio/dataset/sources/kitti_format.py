@@ -7,12 +7,12 @@ number and the track id in front. Described in the KITTI devkits' readme files.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
-from carstudio.dataset.sources.frame import Vector3
+from carstudio.dataset.sources.frame import CameraOffset, Vector3
 from carstudio.errors import InputError
 from carstudio.geometry.box3d import box_from_kitti
 from carstudio.geometry.camera import camera_offset_from_projection
@@ -120,12 +120,15 @@ def group_tracking_lines(text: str, *, name: str) -> tuple[dict[int, list[Tracki
     return frames, tuple(problems)
 
 
-def parse_calibration(text: str, *, name: str, key: str = "P2") -> KittiCalibration:
+def parse_calibration(
+    text: str, *, name: str, key: str = "P2", camera_offset: CameraOffset = "exact"
+) -> KittiCalibration:
     """Camera `key` of a calibration file; keys with or without a colon (the tracking files mix both)."""
     for line in text.splitlines():
         words = line.split()
         if words and words[0].rstrip(":") == key:
-            return _calibration([_number(word, key, name) for word in words[1:]], name, key)
+            calibration = _calibration([_number(word, key, name) for word in words[1:]], name, key)
+            return calibration if camera_offset == "exact" else replace(calibration, camera_offset=(0.0, 0.0, 0.0))
     raise InputError(f"{name}: no line {key}; expected a KITTI calibration file with P0 to P3")
 
 
@@ -137,6 +140,8 @@ def _calibration(values: Sequence[float], name: str, key: str) -> KittiCalibrati
     if fx <= 0 or fy <= 0 or float(projection[2, 2]) <= 0:
         raise InputError(f"{name}: {key} must have positive focal lengths, found ({fx}, {fy}) px")
     x, y, z = camera_offset_from_projection(projection).tolist()
+    if not all(math.isfinite(value) for value in (x, y, z)):
+        raise InputError(f"{name}: {key} cannot be inverted (focal lengths {fx}, {fy} px); expected a camera's matrix")
     return KittiCalibration((fx, fy, cx, cy), (x, y, z))
 
 

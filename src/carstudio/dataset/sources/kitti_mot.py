@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from carstudio.dataset.sources.frame import Frame, FrameRef
+from carstudio.dataset.sources.frame import CameraOffset, Frame, FrameRef
 from carstudio.dataset.sources.kitti_det import find_image, labelled_object, list_frames, require_frames
 from carstudio.dataset.sources.kitti_format import (
     DONT_CARE,
@@ -73,7 +73,9 @@ class KittiMotSource:
         )
 
 
-def open_kitti_mot(root: Path, *, sequence: str | None = None, frames: str | None = None) -> KittiMotSource:
+def open_kitti_mot(
+    root: Path, *, sequence: str | None = None, frames: str | None = None, camera_offset: CameraOffset = "exact"
+) -> KittiMotSource:
     """One sequence or all of them; `InputError` when there is none."""
     folder = find_layout(root, "image_02", "image_02/SEQ, label_02/SEQ.txt, calib/SEQ.txt")
     names = sorted(path.name for path in (folder / "image_02").iterdir() if path.is_dir())
@@ -87,15 +89,17 @@ def open_kitti_mot(root: Path, *, sequence: str | None = None, frames: str | Non
         sequence_refs = list_frames(folder / "image_02" / name, frames, sequence_id=name)
         if not sequence_refs:
             continue
-        drives[name], found = _open_sequence(folder, name)
+        drives[name], found = _open_sequence(folder, name, camera_offset)
         refs += sequence_refs
         problems += found
     refs_found = require_frames(refs, folder / "image_02", frames)
     return KittiMotSource(folder, refs_found, drives, problems=tuple(problems))
 
 
-def _open_sequence(folder: Path, name: str) -> tuple[Drive, tuple[str, ...]]:
+def _open_sequence(folder: Path, name: str, camera_offset: CameraOffset) -> tuple[Drive, tuple[str, ...]]:
     label_path, calib_path = folder / "label_02" / f"{name}.txt", folder / "calib" / f"{name}.txt"
     lines, problems = group_tracking_lines(read_text(label_path, "label file"), name=f"label_02/{label_path.name}")
-    calibration = parse_calibration(read_text(calib_path, "calibration"), name=f"calib/{calib_path.name}")
+    calibration = parse_calibration(
+        read_text(calib_path, "calibration"), name=f"calib/{calib_path.name}", camera_offset=camera_offset
+    )
     return Drive(lines, calibration), problems

@@ -31,6 +31,7 @@ from carstudio.geometry.box3d import envelope
 from carstudio.geometry.overlap import box2d_iou
 from carstudio.geometry.transforms import quaternion_from_rotation
 from carstudio.images import encode_depth, encode_png
+from carstudio.locks import clear_leftovers
 from carstudio.progress import Report, silent
 from carstudio.synthetic.benchmark import BENCHMARK_CARS, BENCHMARK_SEED, BENCHMARK_SIZE_PX, BENCHMARK_VIEWS
 from carstudio.synthetic.cameras import CameraKind
@@ -89,8 +90,8 @@ def synthesize(config: SynthConfig, report: Report = silent) -> BuildSummary:
     start = time.perf_counter()
     _check(config)
     if is_made_already(config.out, asdict(config)):
-        store = open_store(config.out)
-        return summarize(store, source=SOURCE, verdicts=store.verdicts())
+        clear_leftovers(config.out)
+        return summarize(open_store(config.out), source=SOURCE)
     files = mesh_files(config.meshes)
     with StoreWriter(config.out, source=SOURCE, resume_key=_resume_key(config, files)) as writer:
         write_run(config.out, asdict(config))
@@ -102,8 +103,8 @@ def synthesize(config: SynthConfig, report: Report = silent) -> BuildSummary:
                     if not writer.has(record.patch_id):
                         writer.append(record)
                 report("photograph", done, config.cars, f"{len(writer)} photos")
-        verdicts = judge_and_split(writer, KEEP_ALL)
-    summary = summarize(open_store(config.out), source=SOURCE, verdicts=verdicts)
+        judge_and_split(writer, KEEP_ALL)
+    summary = summarize(open_store(config.out), source=SOURCE)
     return replace(summary, seconds=time.perf_counter() - start)
 
 
