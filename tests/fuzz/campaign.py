@@ -4,6 +4,7 @@ Input number i of a seed is always the same, whatever the number of processes. A
 input down before it reads it, so that an input that ends the process (a crash in native code, a hang) is known.
 """
 
+import faulthandler
 import json
 import mmap
 import os
@@ -130,6 +131,7 @@ class _Share:
 
     def _read_all(self, pipe: int) -> None:
         code = 1
+        faulthandler.disable()  # pytest's: a crash is told by the parent
         try:
             _bound_memory()
             self._loop(pipe)

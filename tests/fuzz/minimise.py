@@ -1,5 +1,6 @@
 """Making a find small: fewer edits first, then fewer bytes, as long as the same thing happens."""
 
+import faulthandler
 import json
 import os
 import random
@@ -21,6 +22,7 @@ def same_thing(target: Target, folder: Path) -> Callable[[Files], str]:
         reading, writing = os.pipe()
         pid = os.fork()
         if pid == 0:
+            faulthandler.disable()
             signal.alarm(60)
             os.write(writing, attempt(target, files, folder)[1].encode())
             os._exit(0)

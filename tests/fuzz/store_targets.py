@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from carstudio.dataset.filters import FilterRecipe, judge
-from carstudio.dataset.manifest import read_manifest, write_manifest
+from carstudio.dataset.manifest import data_sha256, read_manifest, write_manifest
 from carstudio.dataset.patch import PatchRecord
 from carstudio.dataset.schema import LIGHT_COLUMNS, SCHEMA, check_id
 from carstudio.dataset.splits import write_splits
@@ -23,7 +23,7 @@ from fuzz.edits import Files
 from fuzz.target import Target, write_files
 from training.toy import toy_record
 
-SHARD, ROWS = "data/part-00000.parquet", "rows.json"
+MANIFEST, SHARD, ROWS = "manifest.json", "data/part-00000.parquet", "rows.json"
 
 
 @cache
@@ -37,7 +37,7 @@ def _store_files() -> Files:
         store = open_store(folder)
         store.write_verdicts([judge(record, FilterRecipe()) for record in store.light_records()])
         write_splits(store)
-        names = ("manifest.json", SHARD, "verdicts.parquet", "splits/instance.parquet")
+        names = (MANIFEST, SHARD, "verdicts.parquet", "splits/instance.parquet")
         return {name: (folder / name).read_bytes() for name in names}
 
 
@@ -51,9 +51,20 @@ def _rows() -> list[dict[str, Any]]:
 
 def manifest_seeds() -> list[Files]:
     """One of a finished store, one of a store whose writing was cut off."""
-    unfinished = {"is_finished": False, "resume_key": "ab" * 32, "shards": [], "num_patches": 0}
-    whole = json.loads(_store_files()["manifest.json"])
-    return [{"manifest.json": json.dumps(value, indent=1).encode()} for value in (whole, {**whole, **unfinished})]
+    whole = json.loads(_store_files()[MANIFEST])
+    unfinished = {**whole, "is_finished": False, "resume_key": "ab" * 32, "shards": []}
+    return [mend_manifest({MANIFEST: json.dumps(value, indent=1).encode()}) for value in (whole, unfinished)]
+
+
+def mend_manifest(files: Files) -> Files:
+    """Totals as the shards say, whatever they say."""
+    try:
+        value = json.loads(files[MANIFEST])
+        value["num_patches"] = sum(shard["num_patches"] for shard in value["shards"])
+        value["data_sha256"] = data_sha256((shard["name"], shard["sha256"]) for shard in value["shards"])
+        return {**files, MANIFEST: json.dumps(value, indent=1).encode()}
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return files
 
 
 def read_a_manifest(files: Files, folder: Path) -> None:
@@ -140,6 +151,6 @@ def _judge(folder: Path) -> None:
 
 
 STORE_TARGETS = (
-    Target("manifest", manifest_seeds, read_a_manifest),
+    Target("manifest", manifest_seeds, read_a_manifest, mend_manifest),
     Target("store", store_seeds, read_store),
 )

@@ -75,7 +75,7 @@ def read_manifest(folder: Path) -> Manifest:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f'{path}: expected "format": "{FORMAT}", found another kind of manifest; choose a store')
     version = content.get("format_version")
-    if _is_count(version) and version > FORMAT_VERSION:
+    if isinstance(version, int) and version > FORMAT_VERSION:
         raise InputError(
             f"{path}: format version {version}, this program reads up to {FORMAT_VERSION}; update carstudio"
         )
@@ -96,7 +96,7 @@ def is_finished_store(folder: Path) -> bool:
 def _problems(content: dict[str, Any]) -> Iterator[str]:
     """What fields hold that they must not; totals that contradict the shards show that one of them was changed."""
     version, sources, resume_key = (content.get(name) for name in ("format_version", "sources", "resume_key"))
-    if not _is_count(version) or version < 1:
+    if not _is_count(version) or version == 0:
         yield f"format_version must be a whole number from 1 on, found {_short(version)}"
     if not isinstance(content.get("is_finished"), bool):
         yield f"is_finished must be true or false, found {_short(content.get('is_finished'))}"
@@ -122,7 +122,8 @@ def _problems(content: dict[str, Any]) -> Iterator[str]:
 
 def _shard_problems(shard: Any) -> Iterator[str]:
     if not isinstance(shard, dict) or shard.keys() != _SHARD_KEYS:
-        yield f"a shard must have {', '.join(sorted(_SHARD_KEYS))}, found {_short(shard)}"
+        found = sorted(shard) if isinstance(shard, dict) else shard
+        yield f"a shard must have {', '.join(sorted(_SHARD_KEYS))}, found {_short(found)}"
         return
     name, count, checksum = shard["name"], shard["num_patches"], shard["sha256"]
     if not (isinstance(name, str) and _SHARD_NAME.fullmatch(name)):
