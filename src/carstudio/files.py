@@ -125,6 +125,20 @@ def parse_json(text: str | bytes, *, name: str) -> Any:
         raise InputError(f"{name}: expected JSON, found one value in another, hundreds deep") from error
 
 
+def read_bounded(path: Path | str, what: str, *, max_bytes: int) -> bytes:
+    """A whole file; `InputError` when it cannot be read or is larger than anything of its kind."""
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            data = file.read(max_bytes + 1)
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        reason = (error.strerror or error) if isinstance(error, OSError) else error
+        raise InputError(f"{path}: {what} cannot be read ({reason})") from error
+    if len(data) > max_bytes:
+        raise InputError(f"{path}: at most {max_bytes / 1e6:.0f} MB are read of one {what}, found more; check the file")
+    return data
+
+
 def sha256_file(path: Path | str) -> str:
     """Hexadecimal sha256 of a file's bytes."""
     with Path(path).open("rb") as file:

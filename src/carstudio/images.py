@@ -13,12 +13,18 @@ from jaxtyping import Float, Shaped, UInt8
 from PIL import Image
 
 from carstudio.errors import InputError
-from carstudio.files import write_bytes
+from carstudio.files import read_bounded, write_bytes
 
 MAX_IMAGE_PIXELS = 120_000_000  # 12,000 x 10,000: larger than any camera's photo, small enough for a laptop's memory
+MAX_IMAGE_BYTES = 4 * MAX_IMAGE_PIXELS  # uncompressed, with an alpha channel
+# What Pillow may open. Not all that it knows: some of its readers start other programs (EPS: Ghostscript).
+FORMATS = ("PNG", "JPEG", "MPO", "WEBP", "TIFF", "BMP", "GIF", "PPM")
 DEPTH_STEPS_PER_METRE = 256.0  # KITTI's depth PNG
-# What Pillow raises on damaged files, as fuzzing found.
-BROKEN = (OSError, ValueError, SyntaxError, EOFError, TypeError, KeyError, IndexError, OverflowError, struct.error)
+# What Pillow raises on damaged files, as fuzzing found; its bomb error also for a frame larger than its image.
+BROKEN = (
+    OSError, ValueError, SyntaxError, EOFError, TypeError, KeyError, IndexError, OverflowError, struct.error,
+    Image.DecompressionBombError,
+)  # fmt: skip
 TURNS = {  # EXIF orientation -> what turns the stored pixels upright; 1 (and anything unknown) is upright
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -43,7 +49,7 @@ def decode_image(data: bytes, *, name: str, mode: str = "RGB") -> UInt8[np.ndarr
             image = image.transpose(turn)
         if mode == "RGB" and image.mode in ("I;16", "I;16B", "I"):
             image = Image.fromarray((np.asarray(image).astype(np.uint32) >> 8).clip(0, 255).astype(np.uint8))
-        return np.array(image.convert(mode))
+        return np.array(image if image.mode == mode else image.convert(mode))
     except BROKEN as error:
         raise InputError(f"{name}: image is broken or truncated ({error}); replace or remove the file") from error
 
@@ -54,11 +60,15 @@ def _open(data: bytes, name: str) -> Image.Image:
     try:
         with warnings.catch_warnings():  # our own bound follows
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            image = Image.open(io.BytesIO(data))
-    except BROKEN as error:
-        raise InputError(f"{name}: expected an image (PNG, JPEG, ...), found something else ({error})") from error
+            image = Image.open(io.BytesIO(data), formats=FORMATS)
     except Image.DecompressionBombError as error:
-        raise InputError(f"{name}: {error}; at most {MAX_IMAGE_PIXELS} pixels are read") from error
+        raise InputError(f"{name}: {error}; at most {MAX_IMAGE_PIXELS} pixels are read, scale it") from error
+    except BROKEN as error:
+        raise InputError(
+            f"{name}: expected an image ({', '.join(FORMATS)}), found something else ({error}); convert or remove it"
+        ) from error
+    if image.width < 1 or image.height < 1:
+        raise InputError(f"{name}: expected an image, found one of {image.width} x {image.height} pixels; replace it")
     if image.width * image.height > MAX_IMAGE_PIXELS:
         raise InputError(
             f"{name}: {image.width} x {image.height} pixels, at most {MAX_IMAGE_PIXELS} are read; scale it"
@@ -83,12 +93,12 @@ def image_size(data: bytes, *, name: str) -> tuple[int, int]:
 
 def read_image(path: Path | str, *, mode: str = "RGB") -> UInt8[np.ndarray, "height width *channels"]:
     """`decode_image` of a file."""
-    path = Path(path)
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: image cannot be read ({error.strerror})") from error
-    return decode_image(data, name=str(path), mode=mode)
+    return decode_image(read_image_file(path), name=str(path), mode=mode)
+
+
+def read_image_file(path: Path | str) -> bytes:
+    """An encoded image as stored; `InputError` when it cannot be read or is larger than any image that is."""
+    return read_bounded(path, "image", max_bytes=MAX_IMAGE_BYTES)
 
 
 def encode_png(pixels: Shaped[np.ndarray, "height width *channels"]) -> bytes:

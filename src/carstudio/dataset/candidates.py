@@ -10,6 +10,8 @@ import torch
 from jaxtyping import Float, UInt8
 
 from carstudio.dataset.patch import MaskValue, PatchRecord
+from carstudio.dataset.schema import check_id
+from carstudio.dataset.soundness import value_problems
 from carstudio.dataset.sources.frame import Frame, LabelledObject
 from carstudio.errors import InputError
 from carstudio.geometry.box3d import Box3D, envelope, projected_hull_points
@@ -97,15 +99,26 @@ def records_of_frame(
 ) -> FrameResult:
     """Every object of the given types as a record, but those already `done`; a bad object costs only itself."""
     pixels = decode_image(frame.image, name=frame.image_path)
-    records, problems = [], []
+    records: dict[str, PatchRecord] = {}
+    problems = []
     for thing in frame.objects:
         if thing.type not in types or thing.patch_id in done:
             continue
         try:
-            records.append(_record(frame, thing, pixels, segmenter, source, licence))
+            if thing.patch_id in records:
+                raise InputError("labelled twice in one photograph; the first label counts, remove the other")
+            check_id(thing.patch_id, "patch id")
+            check_id(thing.instance_id, "instance id")
+            records[thing.patch_id] = _sound(_record(frame, thing, pixels, segmenter, source, licence))
         except InputError as error:
-            problems.append(f"{thing.patch_id}: {error}")
-    return FrameResult(tuple(records), tuple(problems))
+            problems.append(f"{thing.patch_id[:120]}: {error}")
+    return FrameResult(tuple(records.values()), tuple(problems))
+
+
+def _sound(record: PatchRecord) -> PatchRecord:
+    for problem in value_problems(record):
+        raise InputError(f"{problem}; correct the label or the calibration")
+    return record
 
 
 def _record(

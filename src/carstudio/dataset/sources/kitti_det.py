@@ -20,6 +20,7 @@ from carstudio.dataset.sources.kitti_format import (
     read_text,
 )
 from carstudio.errors import InputError
+from carstudio.images import read_image_file
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -55,7 +56,7 @@ class KittiDetSource:
         return Frame(
             frame_id=ref.stem,
             image_path=image.relative_to(self.folder).as_posix(),
-            image=image.read_bytes(),
+            image=read_image_file(image),
             intrinsics=calibration.intrinsics,
             camera_offset=calibration.camera_offset,
             camera_source="calib:P2",

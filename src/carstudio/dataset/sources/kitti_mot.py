@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from carstudio.dataset.schema import check_id
 from carstudio.dataset.sources.frame import CameraOffset, Frame, FrameRef
 from carstudio.dataset.sources.kitti_det import find_image, labelled_object, list_frames, require_frames
 from carstudio.dataset.sources.kitti_format import (
@@ -21,6 +22,7 @@ from carstudio.dataset.sources.kitti_format import (
     read_text,
 )
 from carstudio.errors import InputError
+from carstudio.images import read_image_file
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class KittiMotSource:
             sequence_id=ref.sequence_id,
             frame_index=ref.index,
             image_path=image.relative_to(self.folder).as_posix(),
-            image=image.read_bytes(),
+            image=read_image_file(image),
             intrinsics=drive.calibration.intrinsics,
             camera_offset=drive.calibration.camera_offset,
             camera_source="calib:P2",
@@ -89,9 +91,18 @@ def open_kitti_mot(
         sequence_refs = list_frames(folder / "image_02" / name, frames, sequence_id=name)
         if not sequence_refs:
             continue
-        drives[name], found = _open_sequence(folder, name, camera_offset)
+        try:
+            check_id(name, "sequence")
+            drives[name], found = _open_sequence(folder, name, camera_offset)
+        except InputError as error:
+            if len(chosen) == 1:
+                raise
+            problems.append(f"sequence {name} skipped: {error}")
+            continue
         refs += sequence_refs
         problems += found
+    if problems and not refs:
+        raise InputError(f"{folder}: no sequence can be read; {problems[0]}")
     refs_found = require_frames(refs, folder / "image_02", frames)
     return KittiMotSource(folder, refs_found, drives, problems=tuple(problems))
 
