@@ -12,6 +12,7 @@ set -eu
 run=$(dirname -- "$0")/../run
 root=$1 out=$2 sequence=${3:-0001} frames=${4:-0-24} segmenter=${5:-grabcut}
 
+case $segmenter in onnx:*) "$run" setup onnx ;; esac
 "$run" demo --out "$out/synthetic"
 "$run" carstudio build kitti-mot --root "$root" --sequence "$sequence" --frames "$frames" --segmenter "$segmenter" \
     --out "$out/cars"

@@ -17,8 +17,8 @@ from carstudio.files import read_bounded, write_bytes
 
 MAX_IMAGE_PIXELS = 120_000_000  # 12,000 x 10,000: larger than any camera's photo, small enough for a laptop's memory
 MAX_IMAGE_BYTES = 4 * MAX_IMAGE_PIXELS  # uncompressed, with an alpha channel
-# What Pillow may open. Not all that it knows: some of its readers start other programs (EPS: Ghostscript).
-FORMATS = ("PNG", "JPEG", "MPO", "WEBP", "TIFF", "BMP", "GIF", "PPM")
+# What Pillow may open (an MPO of a phone is a JPEG). Some of its other readers start programs (EPS: Ghostscript).
+FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "PPM")
 DEPTH_STEPS_PER_METRE = 256.0  # KITTI's depth PNG
 # What Pillow raises on damaged files, as fuzzing found; its bomb error also for a frame larger than its image.
 BROKEN = (

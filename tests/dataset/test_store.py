@@ -431,3 +431,27 @@ def test_pandas_duckdb_and_hugging_face_read_it(tmp_path: Path) -> None:
 
 if __name__ == "__main__":
     _write_and_die(Path(sys.argv[1]))
+
+
+def test_records_one_after_the_other_are_the_records_by_id(tmp_path: Path) -> None:
+    records = write_store(tmp_path / "s", 150, groups_per_shard=1)
+    store = open_store(tmp_path / "s")
+    assert list(store.records()) == records == [store.record(record.patch_id) for record in records]
+
+
+def test_a_damaged_shard_is_told_while_records_are_read_in_order(tmp_path: Path) -> None:
+    write_store(tmp_path / "s", 30)
+    shard = tmp_path / "s" / "data" / "part-00000.parquet"
+    whole, rng = shard.read_bytes(), np.random.default_rng(0)
+    messages = []
+    for _ in range(150):
+        data = bytearray(whole)
+        data[int(rng.integers(4, len(whole) - 8))] ^= 1 << int(rng.integers(8))
+        shard.write_bytes(bytes(data))
+        for read in (lambda: list(open_store(tmp_path / "s").records()), lambda: open_store(tmp_path / "s").info()):
+            try:
+                read()
+            except InputError as error:
+                messages.append(str(error))
+    assert len(messages) > 5
+    assert all(str(shard.parent) in message for message in messages)

@@ -77,20 +77,26 @@ class PatchStore:
         return sum(file.metadata.num_rows for file in self._files)
 
     @cached_property
-    def _files(self) -> list[pq.ParquetFile]:
+    def _paths(self) -> list[Path]:
+        """The shards, which are those that the manifest lists; an unfinished store may hold more."""
         files = {path.name: path for path in shard_paths(self.path)}
-        listed = {shard.name: shard for shard in self.manifest.shards}
-        missing, extra = sorted(listed.keys() - files.keys()), sorted(files.keys() - listed.keys())
+        listed = {shard.name for shard in self.manifest.shards}
+        missing, extra = sorted(listed - files.keys()), sorted(files.keys() - listed)
         if missing:
             raise InputError(f"{self.path}: shards {missing} are missing; restore them or rebuild the store")
         if extra and self.manifest.is_finished:
             raise InputError(f"{self.path}: data/ holds {extra}, which its manifest does not know; remove them")
-        opened = [open_parquet(path, SCHEMA) for path in files.values()]
-        for name, file in zip(files, opened, strict=True):
-            if name in listed and file.metadata.num_rows != listed[name].num_patches:
+        return list(files.values())
+
+    @cached_property
+    def _files(self) -> list[pq.ParquetFile]:
+        opened = [open_parquet(path, SCHEMA) for path in self._paths]
+        counts = {shard.name: shard.num_patches for shard in self.manifest.shards}
+        for path, file in zip(self._paths, opened, strict=True):
+            found, told = file.metadata.num_rows, counts.get(path.name)
+            if told is not None and found != told:
                 raise InputError(
-                    f"{files[name]}: holds {file.metadata.num_rows} patches, the manifest says "
-                    f"{listed[name].num_patches}; restore the shard or the manifest"
+                    f"{path}: holds {found} patches, the manifest says {told}; restore the one or the other"
                 )
         return opened
 
@@ -117,7 +123,7 @@ class PatchStore:
     def _locations(self) -> dict[str, Location]:
         locations: dict[str, Location] = {}
         for shard, file in enumerate(self._files):
-            path = shard_paths(self.path)[shard]
+            path = self._paths[shard]
             with reading(path):
                 column = file.read(columns=["patch_id"])
             ids = _file_names(sound(column, REQUIRED, path)["patch_id"]).to_pylist()
@@ -159,7 +165,7 @@ class PatchStore:
         return self._read_group(shard, group, LIGHT_COLUMNS)
 
     def _read_group(self, shard: int, group: int, columns: Iterable[str]) -> pa.Table:
-        path = shard_paths(self.path)[shard]
+        path = self._paths[shard]
         with reading(path):
             table = self._files[shard].read_row_group(group, columns=list(columns), use_threads=False)
         return sound(table, REQUIRED, path)
@@ -183,8 +189,7 @@ class PatchStore:
 
     def light_records(self) -> Iterator[PatchRecord]:
         """All candidates in store order without their pictures (`image` is empty): for filters."""
-        for shard, file in enumerate(self._files):
-            path = shard_paths(self.path)[shard]
+        for path, file in zip(self._paths, self._files, strict=True):
             with reading(path):
                 table = file.read(columns=list(LIGHT_COLUMNS))
             yield from map(record_from_row, sound(table, REQUIRED, path).to_pylist())

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from carstudio.errors import InputError
+from carstudio.hub import load_from_hub
 
 logger = logging.getLogger(__name__)
 
@@ -59,14 +60,14 @@ class ResNet34Encoder(nn.Module):
         """Weights from the hub or a folder; OSError when there are none, `InputError` when they are no ResNet-34."""
         from transformers import AutoConfig, ResNetModel
 
-        found = AutoConfig.from_pretrained(name)
+        found = load_from_hub(AutoConfig.from_pretrained, name)
         sizes = [getattr(found, key, None) for key in ("model_type", "depths", "hidden_sizes", "layer_type")]
         if sizes != ["resnet", DEPTHS, WIDTHS, "basic"]:
             raise InputError(
                 f"{name}: expected a ResNet-34 (resnet, depths {DEPTHS}, widths {WIDTHS}, basic layers), found "
                 f"{sizes}; name another one or None for random weights"
             )
-        loaded = ResNetModel.from_pretrained(name)
+        loaded = load_from_hub(ResNetModel.from_pretrained, name)
         self.embedder.load_state_dict(loaded.embedder.embedder.state_dict())
         for ours, theirs in zip(self.stages, loaded.encoder.stages[:3], strict=True):
             ours.load_state_dict(theirs.state_dict())

@@ -72,7 +72,12 @@ def describe_model(folder: Path | str) -> ModelDescription:
         found = value.get("format_version") if isinstance(value, dict) else value
         raise InputError(f"{path}: expected format_version {FORMAT_VERSION}, found {found!r}; update carstudio")
     config = config_from_json(value.get("config"), name=str(path))
-    return ModelDescription(config, value.get("provenance", {}), str(value.get("sha256")))
+    provenance, checksum = value.get("provenance", {}), value.get("sha256")
+    if not isinstance(provenance, dict) or not isinstance(checksum, str) or len(checksum) != 64:
+        raise InputError(
+            f"{path}: expected a provenance and the weights' sha256, found {checksum!r}; the file is damaged"
+        )
+    return ModelDescription(config, provenance, checksum)
 
 
 def load_model(path_or_name: Path | str, *, device: torch.device | str = "cpu") -> CategoryModel:
