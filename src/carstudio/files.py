@@ -12,6 +12,7 @@ from typing import Any
 
 from carstudio.errors import InputError, StorageError
 
+_HALF_PAIR = re.compile(r"\\u[dD][89a-fA-F]")
 _PARTIAL = re.compile(r"\..*-[a-z0-9_]{8}\.partial(\.[^.]+)?")  # the temporary names of `atomic_path`
 
 
@@ -108,14 +109,36 @@ def read_json(path: Path | str) -> Any:
 
 
 def parse_json(text: str | bytes, *, name: str) -> Any:
-    """A JSON value; `InputError` for anything else, nesting and numbers that no file of ours has included."""
+    """A JSON value; `InputError` for anything else, nesting and numbers that no file of ours has included.
+
+    Its texts can be written as UTF-8: an escaped half of a surrogate pair without the other is refused too.
+    """
     try:
-        return json.loads(text)
+        value = json.loads(text)
+        if _HALF_PAIR.search(text if isinstance(text, str) else text.decode()):
+            json.dumps(value, ensure_ascii=False).encode()
+        return value
     except ValueError as error:  # JSONDecodeError, UnicodeDecodeError, and Python's limit on the digits of a number
         shown = text[:60] if isinstance(text, str) else text[:60].decode("utf-8", errors="replace")
         raise InputError(f"{name}: expected JSON, found {shown!r} ({error})") from error
     except RecursionError as error:
         raise InputError(f"{name}: expected JSON, found one value in another, hundreds deep") from error
+
+
+def read_bounded(path: Path | str, what: str, *, max_bytes: int) -> bytes:
+    """A whole file; `InputError` when it cannot be read or is larger than anything of its kind."""
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            data = file.read(max_bytes + 1) if size <= max_bytes else b""
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        reason = (error.strerror or error) if isinstance(error, OSError) else error
+        raise InputError(f"{path}: {what} cannot be read ({reason}); replace or remove it") from error
+    if max(size, len(data)) > max_bytes:
+        found = max(size, len(data))
+        raise InputError(f"{path}: expected {what} of at most {max_bytes:,} bytes, found {found:,}; check the file")
+    return data
 
 
 def sha256_file(path: Path | str) -> str:

@@ -4,7 +4,6 @@ Arrays are numpy, (height, width[, channels]). Depth images follow KITTI: value 
 """
 
 import io
-import os
 import struct
 import warnings
 from collections.abc import Iterator
@@ -17,14 +16,18 @@ from PIL import EpsImagePlugin, Image
 from PIL.TiffImagePlugin import TiffImageFile
 
 from carstudio.errors import InputError
-from carstudio.files import write_bytes
+from carstudio.files import read_bounded, write_bytes
 
 MAX_IMAGE_PIXELS = 120_000_000  # 12,000 x 10,000: larger than any camera's photo, small enough for a laptop's memory
-MAX_IMAGE_BYTES = 2**30  # uncompressed 16-bit colour of that many pixels is 0.7 GB
-FORMATS = ("PNG", "JPEG", "GIF", "BMP", "TIFF", "WEBP", "PPM")  # all else is refused: Pillow starts Ghostscript for EPS
+MAX_IMAGE_BYTES = 4 * MAX_IMAGE_PIXELS  # uncompressed, with an alpha channel
+# What Pillow may open (an MPO of a phone is a JPEG). Some of its other readers start programs (EPS: Ghostscript).
+FORMATS = ("PNG", "JPEG", "GIF", "BMP", "TIFF", "WEBP", "PPM")
 DEPTH_STEPS_PER_METRE = 256.0  # KITTI's depth PNG
-# What Pillow raises on damaged files, as fuzzing found.
-BROKEN = (OSError, ValueError, SyntaxError, EOFError, TypeError, KeyError, IndexError, OverflowError, struct.error)
+# What Pillow raises on damaged files, as fuzzing found; its bomb error also for a frame larger than its image.
+BROKEN = (
+    OSError, ValueError, SyntaxError, EOFError, TypeError, KeyError, IndexError, OverflowError, struct.error,
+    Image.DecompressionBombError,
+)  # fmt: skip
 TURNS = {  # EXIF orientation -> what turns the stored pixels upright; 1 (and anything unknown) is upright
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -82,15 +85,17 @@ def _open(data: bytes, name: str) -> Image.Image:
         with warnings.catch_warnings():  # our own bound follows
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             image = Image.open(io.BytesIO(data), formats=FORMATS)
+    except Image.DecompressionBombError as error:
+        raise InputError(
+            f"{name}: its header tells of more pixels than a camera's; at most {MAX_IMAGE_PIXELS:,} are read; scale it"
+        ) from error
     except BROKEN as error:
         raise InputError(
             f"{name}: expected an image ({', '.join(FORMATS)}), found something else or a broken header "
             f"(it begins with {data[:12]!r}); replace or remove the file"
         ) from error
-    except Image.DecompressionBombError as error:
-        raise InputError(
-            f"{name}: its header tells of more pixels than a camera's; at most {MAX_IMAGE_PIXELS:,} are read; scale it"
-        ) from error
+    if image.width < 1 or image.height < 1:
+        raise InputError(f"{name}: expected an image, found one of {image.width} x {image.height} pixels; replace it")
     if image.width * image.height > MAX_IMAGE_PIXELS:
         raise InputError(
             f"{name}: {image.width} x {image.height} pixels; at most {MAX_IMAGE_PIXELS:,} are read; scale it"
@@ -125,20 +130,12 @@ def image_size(data: bytes, *, name: str) -> tuple[int, int]:
 
 def read_image(path: Path | str, *, mode: str = "RGB") -> UInt8[np.ndarray, "height width *channels"]:
     """`decode_image` of a file."""
-    return decode_image(read_encoded(path), name=str(path), mode=mode)
+    return decode_image(read_image_file(path), name=str(path), mode=mode)
 
 
-def read_encoded(path: Path | str) -> bytes:
-    """The bytes of an image file as they are; `InputError` when they cannot be read or are absurdly many."""
-    try:
-        with Path(path).open("rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            data = file.read() if size <= MAX_IMAGE_BYTES else b""
-    except OSError as error:
-        raise InputError(f"{path}: image cannot be read ({error.strerror}); replace or remove it") from error
-    if size > MAX_IMAGE_BYTES:
-        raise InputError(f"{path}: expected an image of at most {MAX_IMAGE_BYTES:,} bytes, found {size:,}; scale it")
-    return data
+def read_image_file(path: Path | str) -> bytes:
+    """An encoded image as stored; `InputError` when it cannot be read or is larger than any image that is."""
+    return read_bounded(path, "an image", max_bytes=MAX_IMAGE_BYTES)
 
 
 def encode_png(pixels: Shaped[np.ndarray, "height width *channels"]) -> bytes:

@@ -49,7 +49,7 @@ def test_a_column_of_another_type_is_named(shard: Path) -> None:
         ({"num_patches": -1}, "num_patches must be 0 or more, found -1"),
         ({"num_patches": "2"}, "num_patches must be 0 or more, found '2'"),
         ({"name": "../../etc/passwd"}, "expected the name of a file in data/"),
-        ({"sha256": 7}, "expected the name of a file in data/ and its sha256"),
+        ({"sha256": 7}, "sha256 must be 64 hexadecimal digits, found 7"),
         ({"colour": "red"}, "colour"),
     ],
 )

@@ -54,6 +54,8 @@ BROKEN_LINES = {
     "000123.txt line 4: height must be a finite number, found 'tall'": _with(8, "tall"),
     "000123.txt line 4: z must be a finite number, found 'nan'": _with(13, "nan"),
     "000123.txt line 4: x must be a finite number, found '1e999'": _with(11, "1e999"),
+    "000123.txt line 4: x must lie between -1e+06 and 1e+06, found '-1e300'": _with(11, "-1e300"),
+    "000123.txt line 4: rotation_y must be a finite number, found '-inf'": _with(14, "-inf"),
     "000123.txt line 4: box size must be positive (length, height, width) in metres, found (-1.0, 1.5, 1.7)": _with(
         10, "-1.0"
     ),
@@ -97,9 +99,19 @@ BROKEN_CALIBRATIONS = {
     "calib/1.txt line 1: P2 must have 12 numbers (3 x 4, row by row), found 3": "P2: 1 2 3\n",
     "calib/1.txt line 1: number 3 of P2 must be a finite number, found 'x'": "P2: 1 2 x\n",
     "calib/1.txt line 1: P2 must have positive focal lengths, found (0.0, 7.0) px": "P2: 0 0 6 0 0 7 1 0 0 0 1 0\n",
-    "calib/1.txt line 1: P2 cannot be inverted (focal lengths 1e-320, 7.0 px); expected a camera's matrix": (
+    "calib/1.txt line 1: P2 must have focal lengths in px (hundreds), found (1e-320, 7.0)": (
         "P2: 1e-320 0 6 0 0 7 1 0 0 0 1 0\n"
     ),
+    "calib/1.txt line 1: number 12 of P2 must be a finite number, found 'nan'": "P2: 7 0 6 0 0 7 1 0 0 0 1 nan\n",
+    "calib/1.txt line 1: number 4 of P2 must lie between -1e+06 and 1e+06, found '1e308'": (
+        "P2: 7 0 6 1e308 0 7 1 0 0 0 1 0\n"
+    ),
+    # its first three columns are singular
+    "calib/1.txt line 1: P2 must be fx 0 cx tx, 0 fy cy ty, 0 0 1 tz (a rectified camera), found "
+    "7 7 6 0 7 7 6 0 0 0 1 0": "P2: 7 7 6 0 7 7 6 0 0 0 1 0\n",
+    # a projection may be scaled: then its entries are no focal lengths
+    "calib/1.txt line 1: P2 must be fx 0 cx tx, 0 fy cy ty, 0 0 1 tz (a rectified camera), found "
+    "14 0 12 0 0 14 2 0 0 0 2 0": "P2: 14 0 12 0 0 14 2 0 0 0 2 0\n",
 }
 
 

@@ -1,58 +1,105 @@
-"""`./run fuzz`: damaged labels, images, stores, checkpoints by the thousand; each must be read or refused in words."""
+"""`./run fuzz`: damaged inputs through every reader; each must end in a sound value or in an `InputError`.
+
+Exit code 1 when one did not; what it was is kept, made small, in a folder.
+"""
 
 import argparse
-import logging
-import resource
+import re
 import sys
-import time
-import warnings
-from functools import partial
+import tempfile
 from pathlib import Path
 
+import torch
+from jaxtyping import install_import_hook
 from rich.console import Console
-from rich.progress import MofNCompleteColumn, Progress
+from rich.progress import Progress
 from rich.table import Table
 
-from fuzz.campaign import Outcome, fuzz
-from fuzz.targets import TARGETS
-
-MEMORY_BYTES = 8 * 2**30  # of the whole process: an input that makes a reader ask for more is a fault
+with install_import_hook("carstudio", "beartype.beartype"):  # a value of another type or shape than promised is a find
+    from fuzz.campaign import Tally, attempt, run_campaign
+    from fuzz.minimise import minimise, save_find
+    from fuzz.targets import TARGETS
 
 
 def main(arguments: list[str]) -> int:
-    """Fuzz the targets in turn; exit code 1 when one did anything but read or refuse."""
+    """Fuzz or replay."""
+    options = parse(arguments)
+    torch.set_num_threads(1)
+    if options.replay:
+        return replay(options.target, options.replay)
+    console, tallies = Console(), []
+    out = Path(options.out or tempfile.mkdtemp(prefix="carstudio-fuzz-finds-"))
+    names = list(TARGETS) if options.target == "all" else [options.target]
+    for name in names:
+        with Progress(console=console, transient=True) as progress:
+            task = progress.add_task(name, total=options.inputs)
+            tally = run_campaign(
+                TARGETS[name],
+                inputs=options.inputs,
+                seed=options.seed,
+                jobs=options.jobs,
+                report=lambda done, task=task, progress=progress: progress.update(task, completed=done),
+            )
+        console.print(describe(tally))
+        keep(tally, out, options.seed, console)
+        tallies.append(tally)
+    console.print(summary(tallies))
+    return 1 if any(tally.finds for tally in tallies) else 0
+
+
+def parse(arguments: list[str]) -> argparse.Namespace:
+    """The command line."""
     parser = argparse.ArgumentParser(prog="./run fuzz", description=__doc__)
     parser.add_argument("--target", choices=[*TARGETS, "all"], default="all")
-    parser.add_argument("--inputs", type=int, default=1000, help="per target (1,000)")
-    parser.add_argument("--seed", type=int, default=0, help="the same seed makes the same inputs (0)")
-    parser.add_argument("--out", type=Path, default=Path("out/fuzz"), help="folder of the inputs that crashed a reader")
+    parser.add_argument("--inputs", type=int, default=1000, help="per target (1000)")
+    parser.add_argument("--seed", type=int, default=0, help="chooses every input (0)")
+    parser.add_argument("--jobs", type=int, default=2, help="processes (2)")
+    parser.add_argument("--out", help="folder for what was found (a temporary one)")
+    parser.add_argument("--replay", help="folder of one find: read its files again and show what happens")
     options = parser.parse_args(arguments)
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
-    logging.disable(logging.WARNING)
-    warnings.simplefilter("ignore", UserWarning)  # Pillow's on damaged EXIF
-    console, found = Console(), False
-    table = Table("target", "inputs", "read", "refused", "faults", "seconds", "slowest (s)")
-    for name in TARGETS if options.target == "all" else [options.target]:
-        started = time.monotonic()
-        with Progress(*Progress.get_default_columns(), MofNCompleteColumn(), console=console, transient=True) as bar:
-            task = bar.add_task(name, total=options.inputs)
-            outcome = fuzz(TARGETS[name], options.inputs, options.seed, partial(bar.advance, task))
-        seconds = time.monotonic() - started
-        row = (outcome.inputs, outcome.accepted, outcome.refused, len(outcome.crashes))
-        table.add_row(name, *(f"{value:,}" for value in row), f"{seconds:.0f}", f"{outcome.slowest_s:.2f}")
-        found |= bool(outcome.crashes)
-        keep(outcome, options.out / name, console)
-    console.print(table)
-    return 1 if found else 0
+    if options.inputs < 1 or options.jobs < 1:
+        parser.error("--inputs and --jobs must be at least 1")
+    if options.replay and options.target == "all":
+        parser.error("--replay needs --target")
+    return options
 
 
-def keep(outcome: Outcome, folder: Path, console: Console) -> None:
-    """The input and the traceback of each fault."""
-    for number, (kind, (data, trace)) in enumerate(outcome.crashes.items()):
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / f"{number}.input").write_bytes(data)
-        (folder / f"{number}.txt").write_text(trace, encoding="utf-8")
-        console.print(f"{folder / str(number)}: {kind}", markup=False)
+def describe(tally: Tally) -> str:
+    """One line."""
+    return (
+        f"{tally.target}: {tally.inputs} inputs, {tally.refused} refused, {tally.seconds:.0f} s, "
+        f"slowest {tally.slowest_s:.1f} s, {len(tally.finds)} kinds of finds"
+    )
+
+
+def keep(tally: Tally, out: Path, seed: int, console: Console) -> None:
+    """Save one small reproducer for each kind of find."""
+    for signature, finds in tally.finds.items():
+        folder = out / tally.target / re.sub(r"[^A-Za-z0-9]+", "-", signature)
+        with tempfile.TemporaryDirectory() as work:
+            files = minimise(TARGETS[tally.target], finds[0], seed=seed, folder=Path(work) / "files")
+        command = f"./run fuzz --target {tally.target} --replay {folder}"
+        save_find(files, finds[0], folder, command=command)
+        console.print(f"  {len(finds)} x {signature}: {command}")
+
+
+def replay(name: str, folder: str) -> int:
+    """Read the files of a find again."""
+    paths = [path for path in Path(folder).rglob("*") if path.is_file() and path.name != "find.json"]
+    files = {str(path.relative_to(folder)): path.read_bytes() for path in paths}
+    with tempfile.TemporaryDirectory() as work:
+        is_no, signature, trace = attempt(TARGETS[name], files, Path(work) / "files")
+    print(trace or ("refused" if is_no else "read"))
+    return 1 if signature else 0
+
+
+def summary(tallies: list[Tally]) -> Table:
+    """Figures per target."""
+    table = Table("target", "inputs", "refused", "time", "slowest", "kinds of finds")
+    for tally in tallies:
+        cells = [f"{tally.inputs:,}", f"{tally.refused:,}", f"{tally.seconds:.0f} s", f"{tally.slowest_s:.2f} s"]
+        table.add_row(tally.target, *cells, str(len(tally.finds)))
+    return table
 
 
 if __name__ == "__main__":

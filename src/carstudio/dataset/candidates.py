@@ -11,6 +11,7 @@ from jaxtyping import Float, UInt8
 
 from carstudio.dataset.patch import MaskValue, PatchRecord
 from carstudio.dataset.schema import check_id
+from carstudio.dataset.soundness import value_problems
 from carstudio.dataset.sources.frame import Frame, LabelledObject
 from carstudio.errors import InputError
 from carstudio.geometry.box3d import Box3D, envelope, projected_hull_points
@@ -107,10 +108,16 @@ def records_of_frame(
             seen.add(thing.patch_id)
             if thing.patch_id in done:
                 continue
-            records.append(_record(frame, thing, pixels, segmenter, source, licence))
+            records.append(_sound(_record(frame, thing, pixels, segmenter, source, licence)))
         except InputError as error:
-            problems.append(f"{thing.patch_id}: {error}")
+            problems.append(f"{thing.patch_id[:120]}: {error}")
     return FrameResult(tuple(records), tuple(problems))
+
+
+def _sound(record: PatchRecord) -> PatchRecord:
+    for problem in value_problems(record):
+        raise InputError(f"{problem}; correct the label or the calibration")
+    return record
 
 
 def _check_ids(thing: LabelledObject, seen: set[str]) -> None:

@@ -4,12 +4,12 @@ Each measures one value against one threshold. A value the source does not know 
 has seen. So a segmenter without a confidence (GrabCut) is judged by the mask's share of the box alone.
 """
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from carstudio.dataset.patch import PatchRecord
 from carstudio.dataset.verdicts import KEPT, Check, Verdict
+from carstudio.files import parse_json
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,8 @@ Filter = Callable[[PatchRecord, FilterRecipe], Check]
 
 def check_type(record: PatchRecord, recipe: FilterRecipe) -> Check:
     """The label's type is one of the recipe's."""
-    label_type = json.loads(record.extra).get("type")
+    extra = parse_json(record.extra, name=f"extra of patch {record.patch_id}")
+    label_type = extra.get("type") if isinstance(extra, dict) else None
     return Check("type", None, None, label_type is None or label_type in recipe.types)
 
 

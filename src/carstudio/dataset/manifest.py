@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,9 @@ from carstudio.files import read_json, write_json
 
 FORMAT = "carpatch3d"
 FORMAT_VERSION = 1
-_SHARD_NAME = re.compile(r"[\w.-]+")
+_SHARD_NAME = re.compile(r"part-[0-9]{5,9}\.parquet")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+_SHARD_KEYS = {"name", "num_patches", "sha256"}
 
 
 @dataclass(frozen=True)
@@ -73,14 +75,14 @@ def read_manifest(folder: Path) -> Manifest:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f'{path}: expected "format": "{FORMAT}", found another kind of manifest; choose a store')
     version = content.get("format_version")
-    if not isinstance(version, int) or version > FORMAT_VERSION:
+    if isinstance(version, int) and version > FORMAT_VERSION:
         raise InputError(
             f"{path}: format version {version}, this program reads up to {FORMAT_VERSION}; update carstudio"
         )
-    try:
-        return _manifest_from_json(content)
-    except (KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: broken manifest ({error!r}); rebuild the store or restore the file") from error
+    problem = next(_problems(content), None)
+    if problem is not None:
+        raise InputError(f"{path}: broken manifest: {problem}; restore the file or rebuild the store")
+    return _manifest_from_json(content)
 
 
 def is_finished_store(folder: Path) -> bool:
@@ -91,20 +93,61 @@ def is_finished_store(folder: Path) -> bool:
         return False
 
 
-def _shard_from_json(value: dict[str, Any]) -> Shard:
-    name, count, checksum = value.get("name"), value.get("num_patches"), value.get("sha256")
-    if not (isinstance(name, str) and _SHARD_NAME.fullmatch(name) and isinstance(checksum, str)):
-        raise TypeError(f"shard {value!r}: expected the name of a file in data/ and its sha256")
-    if isinstance(count, bool) or not isinstance(count, int) or count < 0:
-        raise TypeError(f"shard {name}: num_patches must be 0 or more, found {count!r}")
-    return Shard(**value)
+def _problems(content: dict[str, Any]) -> Iterator[str]:
+    """What fields hold that they must not; totals that contradict the shards show that one of them was changed."""
+    version, sources, resume_key = (content.get(name) for name in ("format_version", "sources", "resume_key"))
+    if not _is_count(version) or version == 0:
+        yield f"format_version must be a whole number from 1 on, found {_short(version)}"
+    if not isinstance(content.get("is_finished"), bool):
+        yield f"is_finished must be true or false, found {_short(content.get('is_finished'))}"
+    if not (resume_key is None or (isinstance(resume_key, str) and resume_key.isprintable())):
+        yield f"resume_key must be a text or null, found {_short(resume_key)}"
+    if not isinstance(sources, list) or not all(isinstance(name, str) and name.isprintable() for name in sources):
+        yield f"sources must be a list of names, found {_short(sources)}"
+    shards = content.get("shards")
+    if not isinstance(shards, list):
+        yield f"shards must be a list, found {_short(shards)}"
+        return
+    for shard in shards:
+        yield from _shard_problems(shard)
+    if len({shard["name"] for shard in shards}) < len(shards):
+        yield "two shards have the same name"
+    total = sum(shard["num_patches"] for shard in shards)
+    if content.get("num_patches") != total:
+        yield f"num_patches must be {total} as its shards say, found {_short(content.get('num_patches'))}"
+    checksum = data_sha256((shard["name"], shard["sha256"]) for shard in shards)
+    if content.get("data_sha256") != checksum:
+        yield f"data_sha256 must be {checksum} as its shards say, found {_short(content.get('data_sha256'))}"
+
+
+def _shard_problems(shard: Any) -> Iterator[str]:
+    if not isinstance(shard, dict) or shard.keys() != _SHARD_KEYS:
+        found = sorted(shard) if isinstance(shard, dict) else shard
+        yield f"a shard must have {', '.join(sorted(_SHARD_KEYS))}, found {_short(found)}"
+        return
+    name, count, checksum = shard["name"], shard["num_patches"], shard["sha256"]
+    if not (isinstance(name, str) and _SHARD_NAME.fullmatch(name)):
+        yield f"shard {_short(name)}: expected the name of a file in data/, such as part-00000.parquet"
+    if not _is_count(count):
+        yield f"shard {_short(name)}: num_patches must be 0 or more, found {_short(count)}"
+    if not (isinstance(checksum, str) and _SHA256.fullmatch(checksum)):
+        yield f"shard {_short(name)}: sha256 must be 64 hexadecimal digits, found {_short(checksum)}"
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**53
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 90 else f"{text[:87]}..."
 
 
 def _manifest_from_json(content: dict[str, Any]) -> Manifest:
     return Manifest(
-        sources=tuple(str(source) for source in content["sources"]),
-        shards=tuple(_shard_from_json(shard) for shard in content["shards"]),
-        is_finished=bool(content["is_finished"]),
+        sources=tuple(content["sources"]),
+        shards=tuple(Shard(**shard) for shard in content["shards"]),
+        is_finished=content["is_finished"],
         resume_key=content.get("resume_key"),
         format_version=content["format_version"],
     )

@@ -17,8 +17,18 @@ import pyarrow.parquet as pq
 
 from carstudio.dataset.manifest import Manifest, data_sha256, read_manifest
 from carstudio.dataset.patch import Patch, PatchRecord
-from carstudio.dataset.reading import reading
-from carstudio.dataset.schema import LIGHT_COLUMNS, PICTURES, SCHEMA, check_id, record_from_row
+from carstudio.dataset.reading import open_parquet, reading, sound
+from carstudio.dataset.schema import (
+    COLUMNS,
+    LIGHT_COLUMNS,
+    PICTURES,
+    REQUIRED,
+    SAFE_ID_PATTERN,
+    SCHEMA,
+    check_id,
+    record_from_row,
+)
+from carstudio.dataset.soundness import value_problems
 from carstudio.dataset.summary import sort_reasons
 from carstudio.dataset.verdicts import VERDICT_SCHEMA, Verdict, table_from_verdicts, verdicts_from_table
 from carstudio.dataset.verify import verify_store
@@ -68,15 +78,27 @@ class PatchStore:
 
     @cached_property
     def _paths(self) -> list[Path]:
-        paths = shard_paths(self.path)
-        missing = {shard.name for shard in self.manifest.shards} - {path.name for path in paths}
+        """The shards, which are those that the manifest lists; an unfinished store may hold more."""
+        files = {path.name: path for path in shard_paths(self.path)}
+        listed = {shard.name for shard in self.manifest.shards}
+        missing, extra = sorted(listed - files.keys()), sorted(files.keys() - listed)
         if missing:
-            raise InputError(f"{self.path}: shards {sorted(missing)} are missing; restore them or rebuild the store")
-        return paths
+            raise InputError(f"{self.path}: shards {missing} are missing; restore them or rebuild the store")
+        if extra and self.manifest.is_finished:
+            raise InputError(f"{self.path}: data/ holds {extra}, which its manifest does not know; remove them")
+        return list(files.values())
 
     @cached_property
     def _files(self) -> list[pq.ParquetFile]:
-        return [_open_shard(path) for path in self._paths]
+        opened = [open_parquet(path, SCHEMA) for path in self._paths]
+        counts = {shard.name: shard.num_patches for shard in self.manifest.shards}
+        for path, file in zip(self._paths, opened, strict=True):
+            found, told = file.metadata.num_rows, counts.get(path.name)
+            if told is not None and found != told:
+                raise InputError(
+                    f"{path}: holds {found} patches, the manifest says {told}; restore the one or the other"
+                )
+        return opened
 
     @cached_property
     def data_sha256(self) -> str:
@@ -94,7 +116,8 @@ class PatchStore:
         if not self._files:
             return SCHEMA.empty_table().select(columns)
         with reading(self.path / "data"):
-            return _validated(pa.concat_tables([file.read(columns=columns) for file in self._files]))
+            table = pa.concat_tables([file.read(columns=columns) for file in self._files])
+        return sound(table, REQUIRED, self.path / "data")
 
     @cached_property
     def _locations(self) -> dict[str, Location]:
@@ -102,7 +125,8 @@ class PatchStore:
         for shard, file in enumerate(self._files):
             path = self._paths[shard]
             with reading(path):
-                ids = _validated(file.read(columns=["patch_id"]))["patch_id"].to_pylist()
+                column = file.read(columns=["patch_id"])
+            ids = _file_names(sound(column, REQUIRED, path)["patch_id"]).to_pylist()
             counts = [file.metadata.row_group(group).num_rows for group in range(file.num_row_groups)]
             if sum(counts) != len(ids):
                 raise InputError(f"{path}: its row groups tell of {sum(counts)} patches, found {len(ids)}; restore it")
@@ -111,6 +135,11 @@ class PatchStore:
                 stop = start + file.metadata.row_group(group).num_rows
                 locations |= {ids[i]: Location(shard, group, i - start) for i in range(start, stop)}
                 start = stop
+        if len(locations) != len(self):
+            raise InputError(
+                f"{self.path}: {len(self)} patches have {len(locations)} different ids; restore the store or build it "
+                "again"
+            )
         return locations
 
     def patch_ids(self, *, kept: bool = True, split: str | None = None, part: str = "all") -> list[str]:
@@ -136,11 +165,13 @@ class PatchStore:
         return self._read_group(shard, group, LIGHT_COLUMNS)
 
     def _read_group(self, shard: int, group: int, columns: Iterable[str]) -> pa.Table:
-        with reading(self._paths[shard]):
-            return _validated(self._files[shard].read_row_group(group, columns=list(columns), use_threads=False))
+        path = self._paths[shard]
+        with reading(path):
+            table = self._files[shard].read_row_group(group, columns=list(columns), use_threads=False)
+        return sound(table, REQUIRED, path)
 
     def record(self, patch_id: str) -> PatchRecord:
-        """One patch as stored."""
+        """One patch as stored; `InputError` when its numbers are none to compute with (infinite, not positive ...)."""
         location = self._locations.get(patch_id)
         if location is None:
             raise InputError(
@@ -148,22 +179,26 @@ class PatchStore:
             )
         tables = (part(location.shard, location.group) for part in (self._light, self._pictures))
         light, pictures = (table.slice(location.row, 1).to_pylist()[0] for table in tables)
-        return record_from_row(light | pictures)
+        record = record_from_row(light | pictures)
+        problem = next(value_problems(record), None)
+        if problem is not None:
+            raise InputError(
+                f"{self.path}: patch {patch_id}: {problem}; `carstudio dataset verify` lists all such patches"
+            )
+        return record
 
     def light_records(self) -> Iterator[PatchRecord]:
         """All candidates in store order without their pictures (`image` is empty): for filters."""
         for path, file in zip(self._paths, self._files, strict=True):
             with reading(path):
-                rows = _validated(file.read(columns=list(LIGHT_COLUMNS))).to_pylist()
-            yield from map(record_from_row, rows)
+                table = file.read(columns=list(LIGHT_COLUMNS))
+            yield from map(record_from_row, sound(table, REQUIRED, path).to_pylist())
 
     def records(self) -> Iterator[PatchRecord]:
         """All candidates in store order, kept or not, with their pictures; one row group is in memory at a time."""
-        for path, file in zip(self._paths, self._files, strict=True):
+        for shard, file in enumerate(self._files):
             for group in range(file.num_row_groups):
-                with reading(path):
-                    rows = _validated(file.read_row_group(group, use_threads=False)).to_pylist()
-                yield from map(record_from_row, rows)
+                yield from map(record_from_row, self._read_group(shard, group, COLUMNS).to_pylist())
 
     def patch(self, patch_id: str) -> Patch:
         """One patch decoded."""
@@ -172,14 +207,14 @@ class PatchStore:
     def verdicts(self) -> list[Verdict]:
         """What the filters decided; empty when nobody judged yet."""
         path = self.path / "verdicts.parquet"
-        return verdicts_from_table(_read_side_table(path)) if path.is_file() else []
+        return verdicts_from_table(_read_side_table(path, VERDICT_SCHEMA)) if path.is_file() else []
 
     def verdict_columns(self, *names: str) -> pa.Table:
         """Some columns of the verdicts, without the checks a fraction of their memory."""
         path = self.path / "verdicts.parquet"
         if not path.is_file():
             return VERDICT_SCHEMA.empty_table().select(names)
-        return _read_side_table(path, list(names))
+        return _read_side_table(path, VERDICT_SCHEMA, list(names))
 
     def _rejected(self) -> pa.ChunkedArray:
         table = self.verdict_columns("patch_id", "is_kept")
@@ -213,7 +248,11 @@ class PatchStore:
         path = self.path / "splits" / f"{check_id(name, 'split name')}.parquet"
         if not path.is_file():
             raise InputError(f"{self.path}: no split {name!r}; there are {self.split_names()}")
-        return _read_side_table(path)
+        table = _read_side_table(path, _SPLIT_SCHEMA)
+        unknown = set(table["part"].unique().to_pylist()) - set(PARTS)
+        if unknown:
+            raise InputError(f"{path}: part must be one of {PARTS}, found {sorted(unknown)[:4]}; write the split again")
+        return table
 
     def write_split(self, name: str, parts: Mapping[str, str]) -> None:
         """Write split `name` (patch_id -> "train" or "test"), in store order."""
@@ -273,23 +312,12 @@ _SPLIT_SCHEMA = pa.schema(
 )
 
 
-def _validated(table: pa.Table) -> pa.Table:
-    """The table, its text checked to be UTF-8 and its offsets to lie in its buffers (ArrowInvalid otherwise)."""
-    table.validate(full=True)
-    return table
-
-
-def _open_shard(path: Path) -> pq.ParquetFile:
-    with reading(path):
-        file = pq.ParquetFile(path, memory_map=True)
-        found = {field.name: field.type for field in file.schema_arrow}
-    for field in SCHEMA:
-        if found.get(field.name) != field.type:
-            raise InputError(
-                f"{path}: column {field.name!r} must be {field.type}, found {found.get(field.name, 'none')}; "
-                "it is no shard of a CarPatch3D store, or a damaged one"
-            )
-    return file
+def _file_names(ids: pa.ChunkedArray) -> pa.ChunkedArray:
+    """Patch ids that may name files: pictures of a patch are written under its id."""
+    is_safe = pc.match_substring_regex(ids, SAFE_ID_PATTERN)
+    if not pc.all(is_safe, min_count=0).as_py():
+        check_id(ids.filter(pc.invert(is_safe))[0].as_py(), "patch id")
+    return ids
 
 
 def _counts(column: pa.ChunkedArray) -> dict[Any, int]:
@@ -297,6 +325,8 @@ def _counts(column: pa.ChunkedArray) -> dict[Any, int]:
     return {row["values"]: row["counts"] for row in pc.value_counts(column).to_pylist()}
 
 
-def _read_side_table(path: Path, columns: list[str] | None = None) -> pa.Table:
+def _read_side_table(path: Path, schema: pa.Schema, columns: list[str] | None = None) -> pa.Table:
+    file = open_parquet(path, schema)
     with reading(path):
-        return pq.read_table(path, columns=columns)
+        table = file.read(columns=columns)
+    return sound(table, schema.names, path)

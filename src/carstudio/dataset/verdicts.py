@@ -5,8 +5,11 @@ They lie beside the data, keyed by patch_id, so that filtering again never touch
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import pyarrow as pa
+
+from carstudio.errors import InputError
 
 KEPT = "kept"  # the reason of a patch that passed everything
 
@@ -62,7 +65,7 @@ def table_from_verdicts(verdicts: Iterable[Verdict]) -> pa.Table:
 
 
 def verdicts_from_table(table: pa.Table) -> list[Verdict]:
-    """Inverse of `table_from_verdicts`."""
+    """Inverse of `table_from_verdicts`; `InputError` names the patch whose checks lack something."""
     return [
         Verdict(
             patch_id=row["patch_id"],
@@ -71,5 +74,15 @@ def verdicts_from_table(table: pa.Table) -> list[Verdict]:
             failed=tuple(row["failed"]),
             checks=tuple(Check(**check) for check in row["checks"]),
         )
-        for row in table.to_pylist()
+        for row in map(_whole, table.to_pylist())
     ]
+
+
+def _whole(row: dict[str, Any]) -> dict[str, Any]:
+    is_whole = all(check and check["filter"] is not None and check["is_passed"] is not None for check in row["checks"])
+    if not is_whole or None in row["failed"]:
+        raise InputError(
+            f"verdicts.parquet: patch {row['patch_id']!r}: every check must have a filter and its outcome, found "
+            f"{str(row['checks'])[:80]}; judge the store again with `carstudio dataset refilter`"
+        )
+    return row

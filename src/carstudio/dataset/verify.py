@@ -1,16 +1,16 @@
 """Checking a store against its checksums and against itself."""
 
 import hashlib
-import math
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from carstudio.dataset.patch import MaskValue, PatchRecord
-from carstudio.dataset.schema import TUPLES, check_id
-from carstudio.dataset.writer import describe_shard, shard_paths
+from carstudio.dataset.soundness import value_problems
+from carstudio.dataset.writer import count_patches, shard_paths
 from carstudio.errors import InputError
+from carstudio.files import sha256_file
 from carstudio.images import decode_image, image_size
 
 if TYPE_CHECKING:
@@ -22,16 +22,31 @@ def verify_store(store: "PatchStore") -> list[str]:
     problems = list(_shard_problems(store))
     if problems:
         return problems
+    for part in (_patch_problems, _verdict_problems, _split_problems):
+        try:
+            problems.extend(part(store))
+        except InputError as error:  # what cannot be read ends its part, not the others
+            problems.append(str(error))
+    return problems
+
+
+def _patch_problems(store: "PatchStore") -> Iterator[str]:
     for record in store.records():
-        problems += [f"patch {record.patch_id}: {problem}" for problem in record_problems(record)]
+        yield from (f"patch {record.patch_id}: {problem}" for problem in record_problems(record))
+
+
+def _verdict_problems(store: "PatchStore") -> Iterator[str]:
     known = set(store.patch_ids(kept=False))
     for patch_id in store.verdict_columns("patch_id")["patch_id"].to_pylist():
         if patch_id not in known:
-            problems.append(f"verdicts.parquet: patch {patch_id} is not in the store")
+            yield f"verdicts.parquet: patch {patch_id} is not in the store"
+
+
+def _split_problems(store: "PatchStore") -> Iterator[str]:
+    known = set(store.patch_ids(kept=False))
     for name in store.split_names():
         unknown = store.split(name).keys() - known
-        problems += [f"splits/{name}.parquet: patch {patch_id} is not in the store" for patch_id in sorted(unknown)]
-    return problems
+        yield from (f"splits/{name}.parquet: patch {patch_id} is not in the store" for patch_id in sorted(unknown))
 
 
 def _shard_problems(store: "PatchStore") -> Iterator[str]:
@@ -42,8 +57,10 @@ def _shard_problems(store: "PatchStore") -> Iterator[str]:
     for name, shard in listed.items():
         if name not in found:
             yield f"data/{name}: missing"
-        elif describe_shard(found[name]) != shard:
+        elif sha256_file(found[name]) != shard.sha256:
             yield f"data/{name}: sha256 differs from the manifest's; the file was changed or damaged"
+        elif count_patches(found[name]) != shard.num_patches:
+            yield f"data/{name}: holds {count_patches(found[name])} patches, the manifest says {shard.num_patches}"
     if store.manifest.is_finished:
         for name in found.keys() - listed.keys():
             yield f"data/{name}: not in the manifest"
@@ -51,23 +68,13 @@ def _shard_problems(store: "PatchStore") -> Iterator[str]:
 
 def record_problems(record: PatchRecord) -> list[str]:
     """What is wrong with one record, apart from its place in a store."""
-    problems: list[str] = []
+    problems = list(value_problems(record))
     try:
-        check_id(record.patch_id, "patch id")
-        check_id(record.instance_id, "instance id")
         problems += _picture_problems(record)
     except InputError as error:
         problems.append(str(error))
     if hashlib.sha256(record.image).hexdigest() != record.sha256:
         problems.append("sha256 of the image differs from the column's")
-    for name in TUPLES:
-        values = getattr(record, name)
-        if values is not None and not all(map(math.isfinite, values)):
-            problems.append(f"{name} {values} is not finite")
-    if record.box_size is not None and min(record.box_size) <= 0:
-        problems.append(f"box_size {record.box_size} is not positive")
-    if min(record.fx, record.fy) <= 0:
-        problems.append(f"focal length ({record.fx}, {record.fy}) px is not positive")
     return problems
 
 

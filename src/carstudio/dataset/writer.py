@@ -65,6 +65,7 @@ def _shard_writer(path: Path) -> Iterator[Callable[[list[PatchRecord]], None]]:
             compression=_COMPRESSION,
             use_dictionary=_SMALL_LEAVES,
             write_statistics=_SMALL_LEAVES,
+            write_page_checksum=True,  # a flipped byte is told when it is read, not only by `dataset verify`
         ) as writer,
     ):
         yield lambda records: writer.write_table(table_from_records(records), row_group_size=ROWS_PER_GROUP)

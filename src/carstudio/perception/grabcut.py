@@ -17,6 +17,7 @@ from carstudio.perception.hulls import (
     occluded_pixels,
     outline,
     shrink,
+    visible_height_px,
 )
 from carstudio.perception.results import MaskResult, SegmentRequest
 
@@ -36,7 +37,7 @@ class GrabCutSegmenter:
     def segment(self, request: SegmentRequest) -> MaskResult:
         """Car where the cut says so, inside the outline (or the 2-D box when there is none)."""
         context = enlarged_window(request, self.enlarge)
-        allowed = allowed_pixels(request, self.margin * (request.box2d[3] - request.box2d[1]), context)
+        allowed = allowed_pixels(request, self.margin * visible_height_px(request), context)
         occluded = occluded_pixels(request, context)
         core = np.zeros_like(allowed)
         for part in request.core or (shrink(outline(request), self.core),):

@@ -45,6 +45,11 @@ def shrink(hull: Float[np.ndarray, "n 2"], factor: float) -> Float[np.ndarray, "
     return center + (hull - center) * factor
 
 
+def visible_height_px(request: SegmentRequest) -> float:
+    """Height of the 2-D box inside the photograph: a label may claim a box of any size."""
+    return min(request.box2d[3], float(request.image.shape[0])) - max(request.box2d[1], 0.0)
+
+
 def occluded_pixels(request: SegmentRequest, window: Window) -> Bool[np.ndarray, "height width"]:
     """Pixels of the window inside the outline of a nearer object: the car may or may not be seen there."""
     occluded = np.zeros((window.height, window.width), bool)

@@ -16,10 +16,11 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from carstudio.errors import InputError
-from carstudio.perception.hulls import allowed_pixels, clean_mask, enlarged_window, occluded_pixels
+from carstudio.perception.hulls import allowed_pixels, clean_mask, enlarged_window, occluded_pixels, visible_height_px
 from carstudio.perception.results import MaskResult, SegmentRequest
 
 VOC_CAR = 7
+_ROUNDING = 1e-3  # of a probability, in networks of half precision
 _SIDE_STEP = 32  # the network's sides are multiples of this ...
 _SIDE_LEAST = 64  # ... and at least this
 
@@ -41,8 +42,7 @@ class OnnxSegmenter:
         probability = self._probability(np.ascontiguousarray(request.image[context.slices]))
         window = request.window
         probability = probability[window.within(context).slices]
-        height_px = request.box2d[3] - request.box2d[1]
-        allowed = allowed_pixels(request, self.margin * height_px, window)
+        allowed = allowed_pixels(request, self.margin * visible_height_px(request), window)
         unknown = occluded_pixels(request, window) & allowed
         car = clean_mask((probability > self.threshold) & allowed & ~unknown) & ~unknown
         return MaskResult(car, unknown, float(probability[car].mean()) if car.any() else 0.0)
@@ -55,10 +55,8 @@ class OnnxSegmenter:
         below, right = (_padded(side) - side for side in scaled.shape[:2])
         padded = cv2.copyMakeBorder(scaled, 0, below, 0, right, cv2.BORDER_REPLICATE)
         inputs = padded.astype(np.float32).transpose(2, 0, 1)[None]
-        session = open_session(str(self.file))
-        output = session.run(None, {session.get_inputs()[0].name: inputs})[0]
-        probability = np.asarray(output)[0, VOC_CAR, : size[1], : size[0]]
-        return cv2.resize(probability, (width, height), interpolation=cv2.INTER_LINEAR)
+        probability = _run(open_session(str(self.file)), inputs, str(self.file))[: size[1], : size[0]]
+        return cv2.resize(np.ascontiguousarray(probability), (width, height), interpolation=cv2.INTER_LINEAR)
 
 
 def _padded(side: int) -> int:
@@ -81,7 +79,34 @@ def open_session(file: str) -> Any:
         session = onnxruntime.InferenceSession(file, options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's exceptions share no public base class
         raise InputError(f"{file}: expected an ONNX network, found something else ({error})") from error
+    if len(session.get_inputs()) != 1:
+        found = [item.name for item in session.get_inputs()]
+        raise InputError(f"{file}: expected one input, float32 [1, 3, height, width], found {found}")
     shape = session.get_outputs()[0].shape
     if len(shape) != 4 or not isinstance(shape[1], int) or shape[1] <= VOC_CAR:
         raise InputError(f"{file}: expected an output [1, classes, height, width] with VOC's classes, found {shape}")
+    _run(session, np.zeros((1, 3, _SIDE_LEAST, 2 * _SIDE_LEAST), np.float32), file)  # before a build begins
     return session
+
+
+def _run(session: Any, images: Float[np.ndarray, "1 3 h w"], file: str) -> Float[np.ndarray, "h w"]:
+    """Probability that a pixel is of a car; `InputError` when the network is not one that tells it."""
+    try:
+        output = np.asarray(session.run(None, {session.get_inputs()[0].name: images})[0])
+    except Exception as error:  # onnxruntime's exceptions share no public base class
+        raise InputError(
+            f"{file}: expected a network that takes float32 [1, 3, height, width] with sides in steps of {_SIDE_STEP}, "
+            f"found one that fails on {list(images.shape)} ({str(error).splitlines()[0][:200]})"
+        ) from error
+    if output.ndim != 4 or output.shape[1] <= VOC_CAR or output.shape[2:] != images.shape[2:]:
+        raise InputError(
+            f"{file}: expected an output [1, classes, {images.shape[2]}, {images.shape[3]}] for this photograph, found "
+            f"{list(output.shape)}; resample inside the network"
+        )
+    probability = output[0, VOC_CAR].astype(np.float32)
+    if not (probability.min() >= -_ROUNDING and probability.max() <= 1 + _ROUNDING):  # NaN fails too
+        raise InputError(
+            f"{file}: expected probabilities from 0 to 1, found {probability.min():.3g} to {probability.max():.3g}; "
+            "end the network with a softmax"
+        )
+    return probability

@@ -39,7 +39,7 @@ class PrecomputedSegmenter:
         pixels = read_image(path, mode="L")
         if pixels.shape != request.image.shape[:2]:
             raise InputError(
-                f"{path}: mask must have the photograph's size {_size(request.image)}, is {_size(pixels)}; make it again"
+                f"{path}: mask must have the photograph's size {_size(request.image)}, is {_size(pixels)}; remake it"
             )
         window = request.window
         allowed = allowed_pixels(request, 0.0, window)
@@ -54,7 +54,7 @@ def result_from_pixels(
     """Masks of a grey image of the crop."""
     if pixels.shape != (request.window.height, request.window.width):
         expected = f"{request.window.width} x {request.window.height}"
-        raise InputError(f"{name}: mask must have the crop's size {expected}, is {_size(pixels)}; make it again")
+        raise InputError(f"{name}: mask must have the crop's size {expected}, is {_size(pixels)}; remake it")
     unknown = pixels == UNKNOWN_GREY
     return MaskResult((pixels > 0) & ~unknown, unknown, score)
 

@@ -19,6 +19,17 @@ from carstudio.models.zoo import ModelConfig, build_model, config_from_json, con
 FORMAT_VERSION = 1
 WEIGHTS, DESCRIPTION = "model.safetensors", "model.json"
 MAX_SIZE = 16_384  # of any whole number in a model's description: sixty times the paper's widest layer
+# (least, most) of those that the weights' shapes do not tell, that the number of layers follows, or whose 0 is "none"
+LIMITS = {
+    "side_px": (8, 1024),
+    "coarse": (1, 4096),
+    "fine": (0, 4096),
+    "depth": (1, 256),
+    "skip_after": (0, 256),
+    "colour_skip_px": (0, 256),
+    "position_frequencies": (1, 32),
+    "direction_frequencies": (1, 32),
+}
 
 
 @dataclass(frozen=True)
@@ -84,25 +95,29 @@ def load_model(path_or_name: Path | str, *, device: torch.device | str = "cpu") 
     """The model of a run folder, ready to encode, trace and render (evaluation mode)."""
     folder = Path(path_or_name)
     description = describe_model(folder)
-    tensors = load_tensors(folder / WEIGHTS)
-    if sha256_file(folder / WEIGHTS) != description.sha256:
-        raise InputError(
-            f"{folder / WEIGHTS}: sha256 differs from the one in {DESCRIPTION}; the two do not belong together. "
-            "Where a kill cut a checkpoint off, `carstudio train ... --resume` writes both again"
-        )
+    tensors = _described_tensors(folder, description)
     _check_before_building(description.config, tensors, folder)
     model = build_model(description.config)
     load_weights(model, tensors, name=str(folder / WEIGHTS))
     return model.to(device).eval()
 
 
+def _described_tensors(folder: Path, description: ModelDescription) -> dict[str, torch.Tensor]:
+    """The weights that `model.json` speaks of."""
+    tensors = load_tensors(folder / WEIGHTS)
+    if sha256_file(folder / WEIGHTS) != description.sha256:
+        raise InputError(
+            f"{folder / WEIGHTS}: sha256 differs from the one in {DESCRIPTION}; the two do not belong together. "
+            "Where a kill cut a checkpoint off, `carstudio train ... --resume` writes both again"
+        )
+    return tensors
+
+
 def _check_before_building(config: ModelConfig, tensors: dict[str, torch.Tensor], folder: Path) -> None:
     """Refuse a description whose sizes are absurd, or are not the weights', before memory is taken for them."""
-    too_large = _sizes_beyond(config_to_json(config), "config")
-    if too_large:
-        raise InputError(
-            f"{folder / DESCRIPTION}: {too_large[0]} must lie between 0 and {MAX_SIZE}; the file is damaged or foreign"
-        )
+    absurd = _sizes_beyond(config_to_json(config), "config")
+    if absurd:
+        raise InputError(f"{folder / DESCRIPTION}: {absurd[0]}; the file is damaged or foreign")
     with torch.device("meta"):
         expected = build_model(config).state_dict()
     _check_names_and_shapes(expected, tensors, name=str(folder / WEIGHTS))
@@ -111,7 +126,10 @@ def _check_before_building(config: ModelConfig, tensors: dict[str, torch.Tensor]
 def _sizes_beyond(value: Any, name: str) -> list[str]:
     if isinstance(value, dict):
         return [found for key, item in value.items() for found in _sizes_beyond(item, f"{name}.{key}")]
-    return [f"{name} = {value}"] if isinstance(value, int) and not 0 <= value <= MAX_SIZE else []
+    if not isinstance(value, int) or isinstance(value, bool):
+        return []
+    least, most = LIMITS.get(name.rpartition(".")[2], (1, MAX_SIZE))
+    return [] if least <= value <= most else [f"{name} = {value} must lie between {least} and {most}"]
 
 
 def load_weights_of(folder: Path, model: CategoryModel, config: ModelConfig) -> str:
@@ -121,13 +139,19 @@ def load_weights_of(folder: Path, model: CategoryModel, config: ModelConfig) -> 
         theirs, ours = config_to_json(description.config), config_to_json(config)
         different = [key for key in ours if theirs.get(key) != ours[key]]
         raise InputError(f"{folder}: its model differs from the recipe's in {different}; start from the same recipe")
-    load_weights(model, load_tensors(folder / WEIGHTS), name=str(folder / WEIGHTS))
+    load_weights(model, _described_tensors(folder, description), name=str(folder / WEIGHTS))
     return f"weights {description.sha256[:16]} of {folder.name}"
 
 
 def load_weights(model: torch.nn.Module, tensors: dict[str, torch.Tensor], *, name: str) -> None:
     """`load_state_dict` with an error a user can read: names what is missing, left over or of another shape."""
     _check_names_and_shapes(model.state_dict(), tensors, name=name)
+    for key, tensor in tensors.items():
+        if not bool(tensor.isfinite().all()):
+            raise InputError(
+                f"{name}: {key} holds numbers that are not finite: its training ran away; use another run, or train "
+                "again with a lower --learning-rate"
+            )
     model.load_state_dict(tensors)
 
 
@@ -136,8 +160,11 @@ def _check_names_and_shapes(expected: dict[str, torch.Tensor], tensors: dict[str
     if missing or extra:
         raise InputError(f"{name}: weights of another model: missing {missing[:4]}, left over {extra[:4]}")
     for key, tensor in tensors.items():
-        if tensor.shape != expected[key].shape:
-            raise InputError(f"{name}: {key} has shape {list(tensor.shape)}, expected {list(expected[key].shape)}")
+        if tensor.shape != expected[key].shape or tensor.dtype != expected[key].dtype:
+            raise InputError(
+                f"{name}: weights of another model: {key} has shape {list(tensor.shape)} of {tensor.dtype}, expected "
+                f"{list(expected[key].shape)} of {expected[key].dtype}"
+            )
 
 
 def pick_device(name: str) -> torch.device:

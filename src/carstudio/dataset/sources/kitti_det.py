@@ -21,7 +21,7 @@ from carstudio.dataset.sources.kitti_format import (
     read_text,
 )
 from carstudio.errors import InputError
-from carstudio.images import read_encoded
+from carstudio.images import read_image_file
 
 _NUMBERED = re.compile(r"\d{1,9}", re.ASCII)  # fits 32 bits
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -58,7 +58,7 @@ class KittiDetSource:
         return Frame(
             frame_id=ref.stem,
             image_path=image.relative_to(self.folder).as_posix(),
-            image=read_encoded(image),
+            image=read_image_file(image),
             intrinsics=calibration.intrinsics,
             camera_offset=calibration.camera_offset,
             camera_source="calib:P2",

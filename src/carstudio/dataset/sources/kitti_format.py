@@ -24,11 +24,11 @@ _FIELDS = (
     "truncation", "occlusion", "alpha", "x0", "y0", "x1", "y1", "height", "width", "length", "x", "y", "z",
     "rotation_y", "score",
 )  # fmt: skip
-_NUMBER = re.compile(
-    r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII
-)  # `float` takes 1_0 and other alphabets' digits
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)  # `float` takes 1_0 and others' digits
 _WHOLE = re.compile(r"-?\d{1,9}", re.ASCII)  # frames and tracks fit 32 bits
-_SQUARE_TOLERANCE = 1e-6  # of fx, fy and 1: how far from a pinhole's zeros and one a calibration may lie
+_MOST = 1e6  # of any number in a label or calibration (px, m, rad, px m): a thousand kilometres
+_LEAST_FOCAL_PX = 1.0  # shorter focal lengths are in metres or millimetres
+_NOISE = 1e-6  # of entries of a projection that must be 0 or 1; KITTI's files have exactly these
 _OCCLUSION_UNKNOWN = 3  # the devkit: 0 visible, 1 partly, 2 largely occluded, 3 unknown
 
 
@@ -86,7 +86,9 @@ def parse_label(line: str, *, where: str) -> KittiLabel:
 def _number(word: str, name: str, where: str) -> float:
     value = float(word) if _NUMBER.fullmatch(word) else math.nan
     if not math.isfinite(value):
-        raise InputError(f"{where}: {name} must be a finite number, found {word!r}")
+        raise InputError(f"{where}: {name} must be a finite number, found {word[:40]!r}")
+    if abs(value) > _MOST:
+        raise InputError(f"{where}: {name} must lie between -{_MOST:.0e} and {_MOST:.0e}, found {word[:40]!r}")
     return value
 
 
@@ -144,12 +146,14 @@ def _calibration(values: Sequence[float], name: str, key: str) -> KittiCalibrati
     if fx <= 0 or fy <= 0:
         raise InputError(f"{name}: {key} must have positive focal lengths, found ({fx}, {fy}) px")
     pinhole = torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
-    if ((projection[:, :3] - pinhole).abs() > _SQUARE_TOLERANCE * pinhole.diag()[:, None]).any():
-        rows = " / ".join(" ".join(f"{value:g}" for value in row[:3]) for row in projection.tolist())
-        raise InputError(f"{name}: {key} must begin fx 0 cx / 0 fy cy / 0 0 1 (a pinhole camera), found {rows}")
+    if float((projection[:, :3] - pinhole).abs().max()) > _NOISE:  # skew or a turn would be dropped without a word
+        raise InputError(
+            f"{name}: {key} must be fx 0 cx tx, 0 fy cy ty, 0 0 1 tz (a rectified camera), found "
+            f"{' '.join(f'{value:g}' for value in values)}"
+        )
+    if min(fx, fy) < _LEAST_FOCAL_PX:
+        raise InputError(f"{name}: {key} must have focal lengths in px (hundreds), found ({fx}, {fy})")
     x, y, z = camera_offset_from_projection(projection).tolist()
-    if not all(math.isfinite(value) for value in (x, y, z)):
-        raise InputError(f"{name}: {key} cannot be inverted (focal lengths {fx}, {fy} px); expected a camera's matrix")
     return KittiCalibration((fx, fy, cx, cy), (x, y, z))
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from carstudio.dataset.schema import check_id
 from carstudio.dataset.sources.frame import CameraOffset, Frame, FrameRef
 from carstudio.dataset.sources.kitti_det import find_image, labelled_object, list_frames, require_frames
 from carstudio.dataset.sources.kitti_format import (
@@ -21,7 +22,7 @@ from carstudio.dataset.sources.kitti_format import (
     read_text,
 )
 from carstudio.errors import InputError
-from carstudio.images import read_encoded
+from carstudio.images import read_image_file
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class KittiMotSource:
             sequence_id=ref.sequence_id,
             frame_index=ref.index,
             image_path=image.relative_to(self.folder).as_posix(),
-            image=read_encoded(image),
+            image=read_image_file(image),
             intrinsics=drive.calibration.intrinsics,
             camera_offset=drive.calibration.camera_offset,
             camera_source="calib:P2",
@@ -91,9 +92,10 @@ def open_kitti_mot(
         if not sequence_refs:
             continue
         try:
+            check_id(name, "sequence")
             drives[name], found = _open_sequence(folder, name, camera_offset)
         except InputError as error:
-            if len(chosen) == 1:
+            if sequence is not None:
                 raise
             problems.append(f"sequence {name} skipped: {error}")
             continue
