@@ -1,69 +1,99 @@
-"""Photo-like pictures by Mitsuba 3 (extra `photo`): the same car, street, sun and camera as the ray caster's, path traced.
+"""Photo-like pictures by Mitsuba 3 (extra `photo`): the ray caster's car, street, light and camera, path traced.
 
 Only colour comes from here; mask, depth, box and camera stay those of the exact rays. Mitsuba draws the car and the
-ground near it; further away the pixel is the street's own radiance, as in `background`.
+ground near it; further away a pixel is the street's own radiance, as in `background`.
 """
 
-from collections.abc import Callable
+import subprocess
+import sys
+from dataclasses import dataclass
+from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
 
 from carstudio.errors import InputError
 from carstudio.synthetic.background import radiance
 from carstudio.synthetic.cameras import Viewpoint
 from carstudio.synthetic.mitsuba_scene import build_scene
+from carstudio.synthetic.photographs import SUBPIXELS, Radiance, Render, unit_rays
 from carstudio.synthetic.shading import Scene
 
 INSTALL_HINT = "pip install 'carstudio[photo]', or ./run setup photo"
-# Compiled for one ray at a time. The variants that compile at run time are up to twice as quick, yet they end the whole
-# process where they meet an LLVM they do not like, and their noise is another one: photos would depend on the machine.
-VARIANT = "scalar_rgb"
-SAMPLES = 64
+QUICK, SURE = "llvm_ad_rgb", "scalar_rgb"  # compiles at run time with LLVM, 2 to 4 times as quick; needs nothing
+PROBE_SECONDS = 120.0  # a cold start with compilation takes about 5
+SAMPLES = 64  # to a pixel: noise of about 2 % on the car, a camera's own
 PASSES = 4  # the samples are taken in so many pictures
-FIREFLY = 2.0  # a pass counts at most this many times the passes' median (and a little): no single bright dots
+FIREFLY = 2.0  # of which none counts more than this many times their median (and a little): no single bright dots
 
 
-def load_mitsuba() -> Any:
+@dataclass(frozen=True)
+class PathTracer:
+    """Mitsuba in one of its variants, whose noise differs."""
+
+    variant: str
+
+    @property
+    def name(self) -> str:
+        """The program's version, variant and samples: with the seed they decide every pixel."""
+        return f"mitsuba {version('mitsuba')} {self.variant} {SAMPLES} samples"
+
+    def prepare(self, scene: Scene) -> Render:
+        """Meshes, materials, ground and sky; the same seed gives the same picture, on any number of threads."""
+        mi = load_mitsuba(self.variant)
+        built = build_scene(mi, scene)
+
+        def render(viewpoint: Viewpoint, seed: int) -> Radiance:
+            sensor = mi.load_dict(sensor_of(mi, viewpoint))
+            seeds = range(seed * PASSES, (seed + 1) * PASSES)
+            passes = [np.array(mi.render(built, sensor=sensor, spp=SAMPLES // PASSES, seed=one)) for one in seeds]
+            rgba = without_fireflies(np.stack(passes))
+            return rgba[..., :3] + (1 - rgba[..., 3:]) * beyond(scene, viewpoint)
+
+        return render
+
+
+def pick_path_tracer() -> PathTracer:
+    """The quick variant where a trial run of it succeeds, else the sure one; `InputError` where Mitsuba is missing."""
+    load_mitsuba(SURE)
+    return PathTracer(QUICK if is_usable(QUICK) else SURE)
+
+
+def is_usable(variant: str) -> bool:
+    """Whether a small picture can be made, tried in a process of its own: a wrong LLVM ends the whole process."""
+    command = [sys.executable, "-m", "carstudio.synthetic.mitsuba_probe", variant]
+    try:
+        ended = subprocess.run(command, capture_output=True, timeout=PROBE_SECONDS, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    return ended.returncode == 0
+
+
+def load_mitsuba(variant: str) -> Any:
     """The module with its variant set, on as many threads as torch takes; `InputError` where it is not installed."""
     try:
         import drjit
         import mitsuba
     except ImportError as error:
-        raise InputError(f"--renderer mitsuba needs Mitsuba 3, which is not installed ({error}): {INSTALL_HINT}") from error
-    mitsuba.set_variant(VARIANT)
+        raise InputError(
+            f"--renderer mitsuba needs Mitsuba 3, which cannot be imported ({error}): {INSTALL_HINT}"
+        ) from error
+    mitsuba.set_variant(variant)
     drjit.set_thread_count(torch.get_num_threads())
     return mitsuba
 
 
-def path_tracer(scene: Scene) -> Callable[[Viewpoint, int], Float[np.ndarray, "height width 3"]]:
-    """Radiance of pictures of a scene, by viewpoint and seed; the same seed gives the same picture."""
-    mi = load_mitsuba()
-    built = build_scene(mi, scene)
-
-    def render(viewpoint: Viewpoint, seed: int) -> Float[np.ndarray, "height width 3"]:
-        sensor = mi.load_dict(sensor_of(mi, viewpoint))
-        passes = np.stack([
-            np.array(mi.render(built, sensor=sensor, spp=SAMPLES // PASSES, seed=seed * PASSES + number))
-            for number in range(PASSES)
-        ])
-        limit = FIREFLY * np.median(passes, axis=0) + 0.2
-        picture = np.minimum(passes, limit).mean(axis=0)
-        return picture[..., :3] + (1 - picture[..., 3:]) * beyond(scene, viewpoint)
-
-    return render
+def without_fireflies(passes: np.ndarray) -> np.ndarray:
+    """Mean of pictures of the same thing, less what only one of them saw: chance finds of the sun in a mirror."""
+    return np.minimum(passes, FIREFLY * np.median(passes, axis=0) + 0.05).mean(axis=0)
 
 
-def beyond(scene: Scene, viewpoint: Viewpoint) -> Float[np.ndarray, "height width 3"]:
-    """The street behind car and ground plane: the mean of 2 x 2 rays to a pixel."""
-    size = viewpoint.camera.width
-    v, u, b, a = np.meshgrid(np.arange(size), np.arange(size), (0.25, 0.75), (0.25, 0.75), indexing="ij")
-    origins, directions = viewpoint.rays(np.stack([u + a, v + b], axis=-1).reshape(-1, 2))
-    directions = (directions / np.linalg.norm(directions, axis=-1, keepdims=True)).astype(np.float32)
-    rgb = radiance(scene.street, scene.light, origins.astype(np.float32), directions, scene.baked.ground_light)
-    return rgb.reshape(size, size, 4, 3).mean(axis=2)
+def beyond(scene: Scene, viewpoint: Viewpoint) -> Radiance:
+    """The street behind the car and the near ground, by the ray caster's rays."""
+    size, per_pixel = viewpoint.camera.width, len(SUBPIXELS) ** 2
+    rgb = radiance(scene.street, scene.light, *unit_rays(viewpoint), scene.baked.ground_light)
+    return rgb.reshape(size, size, per_pixel, 3).mean(axis=2)
 
 
 def sensor_of(mi: Any, viewpoint: Viewpoint) -> dict[str, Any]:

@@ -1,10 +1,12 @@
 """Photographs of a car with exact truth: mask, depth, 3-D box and camera.
 
-The colour of a pixel is the mean of 2 x 2 rays; mask and depth are those of the ray through the pixel's centre, so a
-pixel is "car" exactly when its centre is (no majority vote).
+A `Renderer` makes the colours: the ray caster, by the mean of 2 x 2 rays to a pixel, or another. Mask and depth are
+always those of the exact ray through the pixel's centre: a pixel is "car" exactly when its centre is (no majority vote).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -18,6 +20,39 @@ from carstudio.synthetic.street import draw_street
 from carstudio.synthetic.tracing import Tracer
 
 SUBPIXELS = (0.25, 0.75)
+Radiance = Float[np.ndarray, "height width 3"]
+# Linear radiance of the picture from a viewpoint; the number seeds what is drawn at random.
+Render = Callable[[Viewpoint, int], Radiance]
+
+
+@runtime_checkable
+class Renderer(Protocol):
+    """Makes pictures of scenes. `name` is what is written beside a photo; instances are pickled for workers."""
+
+    @property
+    def name(self) -> str:
+        """The program, and what else decides its pixels."""
+
+    def prepare(self, scene: Scene) -> Render:
+        """Whatever all views of a scene share."""
+
+
+@dataclass(frozen=True)
+class RayCaster:
+    """Our own shading of embree's hits: quick, free of noise, with everything a photo needs to be learned from."""
+
+    name: str = "embree"
+
+    def prepare(self, scene: Scene) -> Render:
+        """Nothing is random here: the seed is not used."""
+
+        def render(viewpoint: Viewpoint, seed: int) -> Radiance:
+            size, per_pixel = viewpoint.camera.width, len(SUBPIXELS) ** 2
+            origins, directions = unit_rays(viewpoint)
+            samples = np.minimum(shade(scene, origins, directions), 8.0)  # a sun glint must not whiten its whole pixel
+            return samples.reshape(size, size, per_pixel, 3).mean(axis=2)
+
+        return render
 
 
 @dataclass(frozen=True)
@@ -50,13 +85,19 @@ def exact_truth(
     return np.isfinite(picture_m), picture_m
 
 
-def take_photograph(scene: Scene, viewpoint: Viewpoint, sensor: Sensor, rng: np.random.Generator) -> Photograph:
-    """Photograph a scene."""
-    size, per_pixel = viewpoint.camera.width, len(SUBPIXELS) ** 2
-    origins, directions = (part.astype(np.float32) for part in viewpoint.rays(pixel_positions(size, SUBPIXELS)))
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    samples = np.minimum(shade(scene, origins, directions), 8.0)  # a sun glint must not whiten its whole pixel
-    radiance = samples.reshape(size, size, per_pixel, 3).mean(axis=2)
+def unit_rays(viewpoint: Viewpoint) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Origins and unit directions (car frame, float32) of the rays whose mean is a pixel, row by row."""
+    positions = pixel_positions(viewpoint.camera.width, SUBPIXELS)
+    origins, directions = (part.astype(np.float32) for part in viewpoint.rays(positions))
+    return origins, directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+
+
+def take_photograph(
+    scene: Scene, viewpoint: Viewpoint, sensor: Sensor, rng: np.random.Generator, radiance: Radiance | None = None
+) -> Photograph:
+    """Photograph a scene: `radiance` (by default the ray caster's) as the sensor shows it, with exact truth."""
+    if radiance is None:
+        radiance = RayCaster().prepare(scene)(viewpoint, 0)
     mask, depth = exact_truth(scene.tracer, viewpoint)
     return Photograph(develop(radiance, sensor, rng), mask, depth, viewpoint, scene.light)
 
@@ -73,16 +114,27 @@ def draw_azimuths(rng: np.random.Generator, num: int) -> Float[np.ndarray, " n"]
 
 
 def draw_photographs(
-    car: Car, *, seed: tuple[int, ...], num_views: int, size_px: int, cameras: CameraKind
+    car: Car,
+    *,
+    seed: tuple[int, ...],
+    num_views: int,
+    size_px: int,
+    cameras: CameraKind,
+    renderer: Renderer | None = None,
 ) -> list[Photograph]:
-    """Views of one car under one light, all around it. View k of a seed is the same whoever asks for it."""
+    """Views of one car under one light, all around it. View k of a seed is the same whoever asks for it.
+
+    Cameras, light and truth are the same for every renderer (the ray caster by default).
+    """
     scene = draw_scene(car, np.random.default_rng([*seed, 1]))
+    render = (renderer or RayCaster()).prepare(scene)
     azimuths = draw_azimuths(np.random.default_rng([*seed, 2]), num_views)
     photographs = []
     for view in range(num_views):
         rng = np.random.default_rng([*seed, 3, view])
         viewpoint = draw_viewpoint(rng, car.mesh, kind=cameras, azimuth_rad=float(azimuths[view]), size_px=size_px)
-        photographs.append(take_photograph(scene, viewpoint, draw_sensor(rng), rng))
+        sensor, noise = draw_sensor(rng), np.random.default_rng([*seed, 4, view]).integers(2**30)
+        photographs.append(take_photograph(scene, viewpoint, sensor, rng, render(viewpoint, int(noise))))
     return photographs
 
 

@@ -37,7 +37,7 @@ from carstudio.synthetic.benchmark import BENCHMARK_CARS, BENCHMARK_SEED, BENCHM
 from carstudio.synthetic.cameras import CameraKind
 from carstudio.synthetic.cars import Car, draw_car
 from carstudio.synthetic.glb import load_glb
-from carstudio.synthetic.photographs import Photograph, draw_photographs
+from carstudio.synthetic.photographs import Photograph, RayCaster, Renderer, draw_photographs
 
 __all__ = ["BuildSummary", "SynthConfig", "frozen_benchmark", "synthesize"]
 
@@ -63,8 +63,9 @@ class SynthConfig:
     """A GLB file or a folder of them (glTF axes: +Y up, +Z front; metres) instead of generated cars."""
     cameras: CameraKind = "mixed"
     """kitti: level, 1.65 m high, 6 to 22 m away; phone: pitched down by 5 to 15 degrees, nearer; mixed: both."""
-    renderer: Literal["embree"] = "embree"
-    """Ray caster."""
+    renderer: Literal["embree", "mitsuba"] = "embree"
+    """Who makes the colours. embree: a ray caster; mitsuba: path traced, more like photographs, some 20 times as slow
+    (extra `photo`). Cameras, light and truth are the same."""
     seed: int = 0
     """The same seed gives the same cars and photos."""
     licence: str | None = None
@@ -92,11 +93,11 @@ def synthesize(config: SynthConfig, report: Report = silent) -> BuildSummary:
     if is_made_already(config.out, asdict(config)):
         clear_leftovers(config.out)
         return summarize(open_store(config.out), source=SOURCE)
-    files = mesh_files(config.meshes)
-    with StoreWriter(config.out, source=SOURCE, resume_key=_resume_key(config, files)) as writer:
+    files, renderer = mesh_files(config.meshes), renderer_of(config)
+    with StoreWriter(config.out, source=SOURCE, resume_key=_resume_key(config, files, renderer)) as writer:
         write_run(config.out, asdict(config))
         todo = [i for i in range(config.cars) if not all(writer.has(name) for name in patch_ids(config, i))]
-        work, workers = partial(car_records, config, files), _num_workers(config, len(todo))
+        work, workers = partial(car_records, config, files, renderer=renderer), _num_workers(config, len(todo))
         with closing(ordered_map(work, todo, workers=workers)) as photographed:
             for done, records in enumerate(photographed, start=1 + config.cars - len(todo)):
                 for record in records:
@@ -161,9 +162,19 @@ def mesh_files(meshes: Path | None) -> list[Path]:
     return files
 
 
-def _resume_key(config: SynthConfig, files: list[Path]) -> str:
+def renderer_of(config: SynthConfig) -> Renderer:
+    """Who makes the colours; `InputError` when an extra for it is missing."""
+    if config.renderer == "embree":
+        return RayCaster()
+    from carstudio.synthetic.mitsuba_renderer import pick_path_tracer
+
+    return pick_path_tracer()
+
+
+def _resume_key(config: SynthConfig, files: list[Path], renderer: Renderer) -> str:
     """What must be equal for an interrupted run to go on; more cars may be asked for than before."""
     settings = {k: v for k, v in asdict(config).items() if k not in ("out", "workers", "meshes", "cars")}
+    settings["renderer"] = renderer.name
     settings["meshes"] = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
 
@@ -189,16 +200,26 @@ def make_car(config: SynthConfig, files: list[Path], index: int) -> Car:
     return draw_car(np.random.default_rng([config.seed, index]))
 
 
-def car_records(config: SynthConfig, files: list[Path], index: int) -> tuple[PatchRecord, ...]:
-    """All patches of one car."""
-    car = make_car(config, files, index)
+def car_records(
+    config: SynthConfig, files: list[Path], index: int, renderer: Renderer | None = None
+) -> tuple[PatchRecord, ...]:
+    """All patches of one car; `renderer` as the config says when it is not given."""
+    car, renderer = make_car(config, files, index), renderer or renderer_of(config)
     photographs = draw_photographs(
-        car, seed=(config.seed, index), num_views=config.views, size_px=config.size, cameras=config.cameras
+        car,
+        seed=(config.seed, index),
+        num_views=config.views,
+        size_px=config.size,
+        cameras=config.cameras,
+        renderer=renderer,
     )
-    return tuple(_record(config, car, index, view, photo) for view, photo in enumerate(photographs))
+    return tuple(
+        _record(config, car, view, photo, patch_id, renderer.name)
+        for view, (photo, patch_id) in enumerate(zip(photographs, patch_ids(config, index), strict=True))
+    )
 
 
-def _record(config: SynthConfig, car: Car, index: int, view: int, photo: Photograph) -> PatchRecord:
+def _record(config: SynthConfig, car: Car, view: int, photo: Photograph, patch_id: str, renderer: str) -> PatchRecord:
     rows, columns = np.nonzero(photo.mask)
     box2d = (float(columns.min()), float(rows.min()), float(columns.max() + 1), float(rows.max() + 1))
     window = crop_window(box2d, config.size, config.size)
@@ -210,12 +231,12 @@ def _record(config: SynthConfig, car: Car, index: int, view: int, photo: Photogr
     fx, fy, cx, cy = camera.intrinsics.tolist()
     is_upright = photo.viewpoint.kind == "kitti"
     rotation = quaternion_from_rotation(torch.tensor(photo.viewpoint.rotation, dtype=torch.float64))
-    patch_id = patch_ids(config, index)[view]
+    car_id = patch_id.rpartition("-")[0]
     return PatchRecord(
         patch_id=patch_id,
-        instance_id=instance_id(config, index),
+        instance_id=car_id,
         frame_id=patch_id,
-        sequence_id=instance_id(config, index),
+        sequence_id=car_id,
         frame_index=view,
         source=SOURCE,
         image=image,
@@ -247,11 +268,11 @@ def _record(config: SynthConfig, car: Car, index: int, view: int, photo: Photogr
         occlusion=0,
         licence=config.licence or ("unknown" if config.meshes else "CC0-1.0"),
         sha256=hashlib.sha256(image).hexdigest(),
-        extra=_extra(config, car, photo),
+        extra=_extra(config, car, photo, renderer),
     )
 
 
-def _extra(config: SynthConfig, car: Car, photo: Photograph) -> str:
+def _extra(config: SynthConfig, car: Car, photo: Photograph, renderer: str) -> str:
     view, light = photo.viewpoint, photo.light
     facts = {
         "style": car.style,
@@ -264,4 +285,6 @@ def _extra(config: SynthConfig, car: Car, photo: Photograph) -> str:
         "to_sun": [round(float(v), 4) for v in light.to_sun],
         "seed": config.seed,
     }
+    if renderer != RayCaster().name:  # photos of the ray caster have no such entry: the frozen benchmark's bytes
+        facts["renderer"] = renderer
     return json.dumps(facts, sort_keys=True)
