@@ -1,7 +1,7 @@
 """Photographs of a car with exact truth: mask, depth, 3-D box and camera.
 
 A `Renderer` makes the colours: the ray caster, by the mean of 2 x 2 rays to a pixel, or another. Mask and depth are
-always those of the exact ray through the pixel's centre: a pixel is "car" exactly when its centre is (no majority vote).
+always those of the exact ray through a pixel's centre: it is "car" exactly when its centre is (no majority vote).
 """
 
 from collections.abc import Callable
