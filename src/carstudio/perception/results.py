@@ -4,6 +4,7 @@ Perception knows nothing of stores: a mask comes as two boolean images, car and 
 Positions are px of the whole photograph, pixel (u, v) centred at (u + 0.5, v + 0.5).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -30,13 +31,41 @@ class Window:
         return Window(self.x0 - outer.x0, self.y0 - outer.y0, self.width, self.height)
 
 
+Box2D = tuple[float, float, float, float]  # x0, y0, x1, y1 px of the photograph
+Vector3 = tuple[float, float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Photo:
+    """A photograph as detectors and estimators of 3-D boxes see it, upright, with its camera."""
+
+    image: UInt8[np.ndarray, "height width 3"]
+    frame_id: str
+    path: str  # relative to the source's root, with forward slashes
+    intrinsics: tuple[float, float, float, float]  # fx, fy, cx, cy px, pixel centres at +0.5
+    camera_offset: Vector3 = (0.0, 0.0, 0.0)  # m; X_camera = X_label_frame + camera_offset
+
+
 @dataclass(frozen=True)
 class Detection2D:
-    """A 2-D box (x0, y0, x1, y1 px) with its class name and confidence in [0, 1]."""
+    """A 2-D box (x0, y0, x1, y1 px) with its class ("Car", "Van", "Truck", "Bus") and confidence in [0, 1]."""
 
-    box2d: tuple[float, float, float, float]
+    box2d: Box2D
     type: str
     score: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Detection3D:
+    """A 3-D box in the camera frame, and the 2-D box (px) by which it is joined to detections."""
+
+    box2d: Box2D
+    type: str
+    center: Vector3  # m, OpenCV camera
+    size: Vector3  # length, height, width, m
+    yaw: float  # rad, KITTI rotation_y
+    rotation: tuple[float, float, float, float] | None = None  # quaternion w, x, y, z where the box is not upright
+    score: float | None = None  # in [0, 1]; None: labelled by people
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,8 +101,24 @@ class Segmenter(Protocol):
 
 
 @runtime_checkable
-class Detector(Protocol):
-    """Finds cars in a photograph."""
+class PhotoSegmenter(Protocol):
+    """A segmenter that looks once at a photograph for all its cars (SAM: one image embedding)."""
 
-    def detect(self, image: UInt8[np.ndarray, "height width 3"]) -> list[Detection2D]:
-        """Boxes in descending order of confidence."""
+    def segment_all(self, requests: Sequence[SegmentRequest]) -> list[MaskResult]:
+        """Masks of each request's window; all requests are of one photograph."""
+
+
+@runtime_checkable
+class Detector(Protocol):
+    """Finds vehicles in photographs; can be pickled. What one photograph gives does not depend on its company."""
+
+    def detect(self, photos: Sequence[Photo]) -> list[list[Detection2D]]:
+        """For each photograph its boxes, inside the photograph, in descending order of confidence."""
+
+
+@runtime_checkable
+class BoxEstimator(Protocol):
+    """Finds 3-D boxes of vehicles in a photograph; can be pickled."""
+
+    def estimate(self, photo: Photo) -> list[Detection3D]:
+        """All boxes, in descending order of confidence where there is one."""
