@@ -6,9 +6,11 @@ Arrays are numpy, (height, width[, channels]). Depth images follow KITTI: value 
 import io
 import struct
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
@@ -126,6 +128,42 @@ def image_size(data: bytes, *, name: str) -> tuple[int, int]:
     image = _open(data, name)
     width, height = (image.tag_v2[256], image.tag_v2[257]) if isinstance(image, TiffImageFile) else image.size
     return (height, width) if _upright_turn(image) in SIDEWAYS else (width, height)
+
+
+@dataclass(frozen=True)
+class ExifLens:
+    """What a photograph's EXIF says of its lens and sensor; None where it does not."""
+
+    focal_35mm: float | None = None  # mm, of the lens with the same field of view on 36 x 24 mm film
+    focal_mm: float | None = None
+    plane_px_per_mm: float | None = None  # pixels of the sensor, along its longer side
+    pixels: tuple[int, int] | None = None  # width and height as taken, before anyone scaled or cropped it
+
+
+def read_exif_lens(data: bytes, *, name: str) -> ExifLens:
+    """EXIF's lens of an encoded photograph; tags that are missing, zero or broken are None."""
+    image = _open(data, name)
+    try:
+        tags = image.getexif().get_ifd(0x8769)
+    except BROKEN:
+        return ExifLens()
+    mm_per_unit = {2: 25.4, 3: 10.0, 4: 1.0}.get(int(_tag(tags, 0xA210) or 2))
+    per_unit = _tag(tags, 0xA20E)
+    size = (int(_tag(tags, 0xA002) or 0), int(_tag(tags, 0xA003) or 0))
+    return ExifLens(
+        focal_35mm=_tag(tags, 0xA405),
+        focal_mm=_tag(tags, 0x920A),
+        plane_px_per_mm=per_unit / mm_per_unit if per_unit and mm_per_unit else None,
+        pixels=size if min(size) > 0 else None,
+    )
+
+
+def _tag(tags: Mapping[int, Any], number: int) -> float | None:
+    try:
+        value = float(tags[number])
+    except (*BROKEN, ZeroDivisionError):
+        return None
+    return value if 0 < value < 1e9 else None
 
 
 def read_image(path: Path | str, *, mode: str = "RGB") -> UInt8[np.ndarray, "height width *channels"]:

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from carstudio.dataset.build import BuildConfig, build, judge_store, open_source
-from carstudio.dataset.candidates import CORE_PARTS, core_hulls, crop_window, object_box, object_hull, occluder_hulls
 from carstudio.dataset.filters import FilterRecipe
+from carstudio.dataset.outlines import CORE_PARTS, core_hulls, crop_window, object_box, object_hull, occluder_hulls
 from carstudio.dataset.patch import MaskValue
 from carstudio.dataset.sources.frame import parse_frame_range
 from carstudio.dataset.store import PatchStore, open_store

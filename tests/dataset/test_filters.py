@@ -1,10 +1,12 @@
 """Filters: each at its threshold, unknown values, and the order of reasons."""
 
+import json
+import math
 from dataclasses import replace
 
 import pytest
 
-from carstudio.dataset.filters import FILTERS, FilterRecipe, judge
+from carstudio.dataset.filters import DVM_CARS, FILTERS, FilterRecipe, judge
 from carstudio.dataset.patch import PatchRecord
 
 RECIPE = FilterRecipe()
@@ -52,14 +54,24 @@ EDGE = {  # filter -> the last change that passes and the first that fails
     "score_mask": ({"score_mask": 0.61}, {"score_mask": 0.6}),
     "mask_ratio": ({"mask_ratio": 0.61}, {"mask_ratio": 0.6}),
     "box3d": ({}, {"box_center": None}),
+    "score_2d": ({"score_2d": 0.61}, {"score_2d": 0.6}),
+    "score_3d": ({"score_3d": 0.61}, {"score_3d": 0.6}),
+    "viewpoint_deg": ({"extra": '{"expected_yaw_deg": -19.9}'}, {"extra": '{"expected_yaw_deg": 340.0}'}),
+    # 300 x 300 px, as released: left of 100, right of 200, above and below 150
+    "centred": (
+        {"frame_width": 300, "frame_height": 300, "box2d": (100.0, 0.0, 200.0, 150.0)},
+        {"frame_width": 300, "frame_height": 300, "box2d": (101.0, 0.0, 210.0, 200.0)},
+    ),
 }
+NOT_BY_DEFAULT = {"centred": FilterRecipe(centred=True)}
 
 
 @pytest.mark.parametrize("name", EDGE)
 def test_each_filter_at_its_threshold(record: PatchRecord, name: str) -> None:
     passes, fails = EDGE[name]
-    assert judge(replace(record, **passes), RECIPE).is_kept  # type: ignore[arg-type]
-    verdict = judge(replace(record, **fails), RECIPE)  # type: ignore[arg-type]
+    recipe = NOT_BY_DEFAULT.get(name, RECIPE)
+    assert judge(replace(record, **passes), recipe).is_kept  # type: ignore[arg-type]
+    verdict = judge(replace(record, **fails), recipe)  # type: ignore[arg-type]
     assert (verdict.is_kept, verdict.reason, verdict.failed) == (False, name, (name,))
 
 
@@ -85,4 +97,26 @@ def test_all_failures_and_values_are_kept(record: PatchRecord) -> None:
 
 
 def test_thresholds_are_the_released_ones() -> None:
-    assert RECIPE == FilterRecipe(("Car",), 64.0, 32.0, 50.0, 0.6, 0.6, 0.7, True)  # FACTS section 2
+    kitti = {
+        "types": ("Car",),
+        "height_px": 64.0,
+        "width_px": 32.0,
+        "depth_m": 50.0,
+        "score_mask": 0.6,
+        "mask_ratio": 0.6,
+    }
+    dvm = kitti | {"width_px": 64.0, "score_2d": 0.6, "score_3d": 0.6, "viewpoint_deg": 20.0, "centred": True}
+    assert {name: getattr(RECIPE, name) for name in kitti} == kitti
+    assert not RECIPE.centred
+    assert {name: getattr(DVM_CARS, name) for name in dvm} == dvm
+
+
+@pytest.mark.parametrize(
+    ("yaw_deg", "expected_deg", "difference"), [(170.0, -175.0, 15.0), (-179.0, 179.0, 2.0), (90.0, -90.0, 180.0)]
+)
+def test_viewpoints_are_compared_around_the_circle(
+    record: PatchRecord, yaw_deg: float, expected_deg: float, difference: float
+) -> None:
+    seen = replace(record, box_yaw=math.radians(yaw_deg), extra=json.dumps({"expected_yaw_deg": expected_deg}))
+    check = next(check for check in judge(seen, RECIPE).checks if check.filter == "viewpoint_deg")
+    assert check.value == pytest.approx(difference)

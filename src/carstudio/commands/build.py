@@ -2,12 +2,11 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
 
 import tyro
 
 from carstudio.commands.command import Outcome, Output, plain
-from carstudio.dataset.build import BuildConfig, build
+from carstudio.dataset.build import BuildConfig, SourceKind, build
 from carstudio.dataset.filters import FilterRecipe
 from carstudio.dataset.sources.frame import CameraOffset
 from carstudio.dataset.summary import BuildSummary
@@ -20,22 +19,34 @@ _SHOWN_PROBLEMS = 20
 class Build(Output):
     """Make a CarPatch3D store: crops, boxes, masks, cameras, and a verdict with its reason for every candidate."""
 
-    source: tyro.conf.Positional[Literal["kitti-det", "kitti-mot", "legacy-json"]]
-    """Kind of input; legacy-json: CarPatch3D as the authors published it."""
-    root: Path
-    """Folder of the source in its official layout; legacy-json: a json file, or the folder with km.json, ko.json ..."""
+    source: tyro.conf.Positional[SourceKind]
+    """Kind of input; photos: pictures of any origin; legacy-json: CarPatch3D as the authors published it."""
+    root: str
+    """Folder of the source in its official layout; photos: a folder, a 'pattern/**/*.jpg', a list (txt, csv, parquet),
+    a URL; legacy-json: a json file, or the folder with km.json, ko.json ..."""
     out: Path
     """The store to write."""
     frames: str | None = None
-    """Frame numbers A-B, both included; all when absent."""
+    """Frame numbers A-B, both included (photos: counted from 0); all when absent."""
     sequence: str | None = None
     """KITTI-MOT: one sequence, such as 0001; all when absent."""
     subset: str | None = None
     """legacy-json: one of km, ko, dv, vk, ns; all that are there when absent."""
     camera_offset: CameraOffset = "exact"
     """exact: boxes are moved by K^-1 P2[:, 3], as KITTI's projection says; as-released: they are not."""
+    detector: str | None = None
+    """Who finds 2-D boxes: labels, transformers[:NAME_OR_DIR], onnx:FILE (YOLOX), precomputed:FILE.json (COCO). Absent:
+    the labels of KITTI, transformers for photos."""
     segmenter: str = "grabcut"
-    """grabcut (no weights), onnx:FILE (better on real frames), precomputed:FOLDER."""
+    """Who finds masks: grabcut (no weights), sam[:NAME_OR_DIR], sam2[:NAME_OR_DIR], onnx:FILE (semantic segmentation),
+    precomputed:FOLDER (PNG), precomputed:FILE.json (COCO)."""
+    box3d: str | None = None
+    """Who finds 3-D boxes: labels, precomputed:FOLDER (KITTI text), precomputed:FILE.json (DD3D), none. Absent: the
+    labels of KITTI, none for photos."""
+    camera: str | None = None
+    """photos: exif (the default), paper, FOCAL_PX, FX,FY,CX,CY or calib:PATH (KITTI calibration)."""
+    licence: str | None = None
+    """photos: their licence, such as CC-BY-4.0."""
     filters: tyro.conf.OmitArgPrefixes[FilterRecipe] = field(default_factory=FilterRecipe)
     """Thresholds; the released ones by default. legacy-json takes none: `dataset refilter` judges it again."""
     workers: int = 0
@@ -55,7 +66,11 @@ class Build(Output):
             sequence=self.sequence,
             subset=self.subset,
             camera_offset=self.camera_offset,
+            detector=self.detector,
             segmenter=self.segmenter,
+            box3d=self.box3d,
+            camera=self.camera,
+            licence=self.licence,
             filters=self.filters,
             workers=self.workers,
         )

@@ -7,111 +7,77 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 
+from carstudio.dataset.masks import masks_of_frame
+from carstudio.dataset.outlines import crop_window, object_box
 from carstudio.dataset.patch import MaskValue, PatchRecord
 from carstudio.dataset.schema import check_id
 from carstudio.dataset.soundness import value_problems
 from carstudio.dataset.sources.frame import Frame, LabelledObject
 from carstudio.errors import InputError
-from carstudio.geometry.box3d import Box3D, envelope, projected_hull_points
+from carstudio.geometry.box3d import Box3D, envelope
 from carstudio.geometry.camera import Camera
 from carstudio.geometry.overlap import box2d_iou
-from carstudio.geometry.transforms import rotation_y
 from carstudio.images import decode_image, encode_png
-from carstudio.perception.hulls import convex_hull
-from carstudio.perception.results import MaskResult, Segmenter, SegmentRequest, Window
-
-# Parts of the box that any car fills, as ranges of canonical x (front), y (down), z (left): body below the window line
-# and cabin. Of five variants the one whose GrabCut masks agree best with the network's; 2.5 % of its pixels are no car.
-CORE_PARTS = (
-    ((-0.9, 0.9), (-0.05, 0.8), (-0.9, 0.9)),
-    ((-0.7, 0.2), (-0.85, 0.0), (-0.65, 0.65)),
-)
+from carstudio.perception.results import MaskResult, PhotoSegmenter, Segmenter
 
 Pixels = UInt8[np.ndarray, "frame_height frame_width 3"]
 
 
 @dataclass(frozen=True)
 class FrameResult:
-    """Records of one frame, and one sentence for each object that could not become one."""
+    """Records of a frame or a few, and one sentence for each object that could not become one."""
 
     records: tuple[PatchRecord, ...]
     problems: tuple[str, ...] = ()
-
-
-def crop_window(box2d: tuple[float, float, float, float], frame_width: int, frame_height: int) -> Window:
-    """Whole pixels of a 2-D box as released: truncated to int, both ends included, clipped to the photograph."""
-    x0, y0 = max(0, int(box2d[0])), max(0, int(box2d[1]))
-    x1, y1 = min(frame_width - 1, int(box2d[2])), min(frame_height - 1, int(box2d[3]))
-    if x1 < x0 or y1 < y0:
-        raise InputError(f"2-D box {box2d} lies outside the photograph of {frame_width} x {frame_height} px")
-    return Window(x0, y0, x1 - x0 + 1, y1 - y0 + 1)
-
-
-def object_box(thing: LabelledObject) -> Box3D | None:
-    """The object's 3-D box in the camera frame, float64."""
-    if thing.box_center is None or thing.box_size is None or thing.box_yaw is None:
-        return None
-    center, size, yaw = (
-        torch.tensor(value, dtype=torch.float64) for value in (thing.box_center, thing.box_size, thing.box_yaw)
-    )
-    return Box3D(center, size, rotation_y(yaw))
-
-
-def object_hull(thing: LabelledObject, camera: Camera) -> Float[np.ndarray, "n 2"] | None:
-    """Convex outline of the projected 3-D box (px); None without a box or when it lies behind the camera."""
-    box = object_box(thing)
-    return None if box is None else box_hull(box, camera)
-
-
-def box_hull(box: Box3D, camera: Camera) -> Float[np.ndarray, "n 2"] | None:
-    """Convex outline of a projected box (px); None when it lies behind the camera."""
-    points = projected_hull_points(box, camera).numpy()
-    return convex_hull(points) if len(points) >= 3 else None
-
-
-def core_hulls(thing: LabelledObject, camera: Camera) -> tuple[Float[np.ndarray, "_ 2"], ...]:
-    """Outlines of `CORE_PARTS` of the object's box; empty without a box."""
-    box = object_box(thing)
-    if box is None:
-        return ()
-    low, high = torch.tensor(CORE_PARTS, dtype=torch.float64).unbind(-1)
-    parts = [
-        Box3D(box.center + box.rotation @ (middle * box.size / 2), share * box.size / 2, box.rotation)
-        for middle, share in zip((low + high) / 2, high - low, strict=True)
-    ]
-    hulls = [box_hull(part, camera) for part in parts]
-    return tuple(hull for hull in hulls if hull is not None)
-
-
-def occluder_hulls(thing: LabelledObject, frame: Frame, camera: Camera) -> tuple[np.ndarray, ...]:
-    """Outlines of the labelled objects of any type whose centre is nearer than this one's."""
-    if thing.box_center is None:
-        return ()
-    nearer = [other for other in frame.objects if other.box_center and other.box_center[2] < thing.box_center[2]]
-    hulls = [object_hull(other, camera) for other in nearer if other.patch_id != thing.patch_id]
-    return tuple(hull for hull in hulls if hull is not None)
+    num_items: int = 1  # frames (or records of another format) that it comes from
 
 
 def records_of_frame(
-    frame: Frame, segmenter: Segmenter, *, source: str, licence: str, types: tuple[str, ...], done: frozenset[str]
+    frame: Frame,
+    segmenter: Segmenter | PhotoSegmenter,
+    *,
+    source: str,
+    licence: str,
+    types: tuple[str, ...],
+    done: frozenset[str],
+    pixels: Pixels | None = None,
 ) -> FrameResult:
-    """Every object of the given types as a record, but those already `done`; a bad object costs only itself."""
-    pixels = decode_image(frame.image, name=frame.image_path)
-    records, problems, seen = [], [], set[str]()
+    """Every object of the given types as a record, but those already `done`; a bad object costs only itself.
+
+    `pixels` are the frame's, where they are decoded already.
+    """
+    pixels = decode_image(frame.image, name=frame.image_path) if pixels is None else pixels
+    height, width = pixels.shape[:2]
+    camera = Camera(torch.tensor(frame.intrinsics, dtype=torch.float64), width, height)
+    wanted, problems = _wanted(frame, types, done)
+    records = []
+    for thing, result in zip(wanted, masks_of_frame(frame, pixels, camera, wanted, segmenter), strict=True):
+        try:
+            if isinstance(result, InputError):
+                raise result
+            records.append(_sound(_record(frame, thing, pixels, camera, result, source, frame.licence or licence)))
+        except InputError as error:
+            problems.append(f"{thing.patch_id[:120]}: {error}")
+    return FrameResult(tuple(records), tuple(problems))
+
+
+def _wanted(frame: Frame, types: tuple[str, ...], done: frozenset[str]) -> tuple[list[LabelledObject], list[str]]:
+    """Objects that become records, and what is wrong with the frame and with those that cannot."""
+    wanted, problems, seen = [], list(frame.problems), set[str]()
     for thing in frame.objects:
         if thing.type not in types:
             continue
         try:
             _check_ids(thing, seen)
-            seen.add(thing.patch_id)
-            if thing.patch_id in done:
-                continue
-            records.append(_sound(_record(frame, thing, pixels, segmenter, source, licence)))
         except InputError as error:
             problems.append(f"{thing.patch_id[:120]}: {error}")
-    return FrameResult(tuple(records), tuple(problems))
+            continue
+        seen.add(thing.patch_id)
+        if thing.patch_id not in done:
+            wanted.append(thing)
+    return wanted, problems
 
 
 def _sound(record: PatchRecord) -> PatchRecord:
@@ -129,12 +95,10 @@ def _check_ids(thing: LabelledObject, seen: set[str]) -> None:
 
 
 def _record(
-    frame: Frame, thing: LabelledObject, pixels: Pixels, segmenter: Segmenter, source: str, licence: str
+    frame: Frame, thing: LabelledObject, pixels: Pixels, camera: Camera, result: MaskResult, source: str, licence: str
 ) -> PatchRecord:
     height, width = pixels.shape[:2]
-    camera = Camera(torch.tensor(frame.intrinsics, dtype=torch.float64), width, height)
     window = crop_window(thing.box2d, width, height)
-    result = segmenter.segment(_request(frame, thing, pixels, camera, window))
     image = encode_png(np.ascontiguousarray(pixels[window.slices]))
     fx, fy, cx, cy = frame.intrinsics
     return PatchRecord(
@@ -163,6 +127,7 @@ def _record(
         box_center=thing.box_center,
         box_size=thing.box_size,
         box_yaw=thing.box_yaw,
+        box_rotation=thing.box_rotation,
         score_2d=thing.score_2d,
         score_mask=None if result.score is None else round(result.score, 6),
         score_3d=thing.score_3d,
@@ -173,20 +138,6 @@ def _record(
         licence=licence,
         sha256=hashlib.sha256(image).hexdigest(),
         extra=json.dumps(thing.extra, sort_keys=True),
-    )
-
-
-def _request(frame: Frame, thing: LabelledObject, pixels: Pixels, camera: Camera, window: Window) -> SegmentRequest:
-    return SegmentRequest(
-        image=pixels,
-        window=window,
-        box2d=thing.box2d,
-        hull=object_hull(thing, camera),
-        core=core_hulls(thing, camera),
-        occluders=occluder_hulls(thing, frame, camera),
-        patch_id=thing.patch_id,
-        frame_id=frame.frame_id,
-        truth_mask=thing.truth_mask,
     )
 
 

@@ -4,8 +4,10 @@ Each measures one value against one threshold. A value the source does not know 
 has seen. So a segmenter without a confidence (GrabCut) is judged by the mask's share of the box alone.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from carstudio.dataset.patch import PatchRecord
 from carstudio.dataset.verdicts import KEPT, Check, Verdict
@@ -24,6 +26,10 @@ class FilterRecipe:
     """Least width of the 2-D box, px (released)."""
     depth_m: float = 50.0
     """Greatest depth of the 3-D box's centre, camera z, m (released)."""
+    score_2d: float = 0.6
+    """The 2-D detector's confidence must be above this (released for DVM-Cars)."""
+    score_3d: float = 0.6
+    """The confidence in the 3-D box must be above this (released for DVM-Cars)."""
     score_mask: float = 0.6
     """The segmenter's confidence must be above this (released: SAM's predicted IoU)."""
     mask_ratio: float = 0.6
@@ -32,18 +38,30 @@ class FilterRecipe:
     """Least IoU of 2-D box and envelope of the projected 3-D box (the paper's filter 1, which gives no number).
     KITTI's labels reach 0.84 to 1 but for a few cars cut off by the image border (0.53, 0.54); 0.7 is the overlap that
     KITTI's own benchmark calls a match for cars."""
+    viewpoint_deg: float = 20.0
+    """Greatest difference of the 3-D box's yaw and the one that the source tells (released for DVM-Cars, deg)."""
+    centred: bool = False
+    """Reject cars that do not span the photograph's centre: its middle third in width, its middle line in height
+    (released for DVM-Cars, whose photographs are of 300 x 300 px)."""
     need_box3d: bool = True
     """Reject patches without a 3-D box: nothing can be trained on them."""
 
 
+DVM_CARS = FilterRecipe(width_px=64.0, centred=True)
+"""The rules that were released for DVM-Cars."""
+EXPECTED_YAW = "expected_yaw_deg"  # in `extra`: what the source says of the viewpoint
 Filter = Callable[[PatchRecord, FilterRecipe], Check]
 
 
 def check_type(record: PatchRecord, recipe: FilterRecipe) -> Check:
     """The label's type is one of the recipe's."""
-    extra = parse_json(record.extra, name=f"extra of patch {record.patch_id}")
-    label_type = extra.get("type") if isinstance(extra, dict) else None
+    label_type = _extra(record).get("type")
     return Check("type", None, None, label_type is None or label_type in recipe.types)
+
+
+def _extra(record: PatchRecord) -> dict[str, Any]:
+    extra = parse_json(record.extra, name=f"extra of patch {record.patch_id}")
+    return extra if isinstance(extra, dict) else {}
 
 
 def check_box3d(record: PatchRecord, recipe: FilterRecipe) -> Check:
@@ -76,6 +94,37 @@ def check_box_iou(record: PatchRecord, recipe: FilterRecipe) -> Check:
     return Check("box_iou", value, recipe.box_iou, value is None or value >= recipe.box_iou)
 
 
+def check_score_2d(record: PatchRecord, recipe: FilterRecipe) -> Check:
+    """The 2-D detector is confident."""
+    value = record.score_2d
+    return Check("score_2d", value, recipe.score_2d, value is None or value > recipe.score_2d)
+
+
+def check_score_3d(record: PatchRecord, recipe: FilterRecipe) -> Check:
+    """Who found the 3-D box is confident."""
+    value = record.score_3d
+    return Check("score_3d", value, recipe.score_3d, value is None or value > recipe.score_3d)
+
+
+def check_centred(record: PatchRecord, recipe: FilterRecipe) -> Check:
+    """The car is what the photograph was taken of."""
+    if record.frame_width is None or record.frame_height is None:
+        return Check("centred", None, None, True)
+    x0, y0, x1, y1 = record.box2d
+    third, half = record.frame_width / 3, record.frame_height / 2
+    spans = x0 <= third and x1 >= 2 * third and y0 <= half <= y1
+    return Check("centred", float(spans), float(recipe.centred), spans or not recipe.centred)
+
+
+def check_viewpoint(record: PatchRecord, recipe: FilterRecipe) -> Check:
+    """The 3-D box is seen from where the source says that the car is seen from."""
+    expected = _extra(record).get(EXPECTED_YAW)
+    if expected is None or record.box_yaw is None:
+        return Check("viewpoint_deg", None, recipe.viewpoint_deg, True)
+    value = abs((math.degrees(record.box_yaw) - float(expected) + 180.0) % 360.0 - 180.0)
+    return Check("viewpoint_deg", value, recipe.viewpoint_deg, value < recipe.viewpoint_deg)
+
+
 def check_score_mask(record: PatchRecord, recipe: FilterRecipe) -> Check:
     """The segmenter is confident."""
     value = record.score_mask
@@ -95,7 +144,11 @@ FILTERS: tuple[Filter, ...] = (
     check_height,
     check_width,
     check_depth,
+    check_centred,
+    check_score_2d,
+    check_score_3d,
     check_box_iou,
+    check_viewpoint,
     check_score_mask,
     check_mask_ratio,
 )

@@ -12,11 +12,13 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Bool
 from skimage.draw import polygon2mask
 
 from carstudio.errors import InputError
 from carstudio.files import read_json
+from carstudio.geometry.overlap import box2d_iou
 from carstudio.perception.hulls import occluded_pixels
 from carstudio.perception.results import Box2D, Detection2D, MaskResult, Photo, SegmentRequest
 from carstudio.perception.rle import decode_rle
@@ -58,10 +60,11 @@ class CocoSegmenter:
     def segment(self, request: SegmentRequest) -> MaskResult:
         """`InputError` when no result overlaps the car's box, or the one that does has no mask."""
         found = results_of(read_results(str(self.file)), request.photo_path, request.frame_id)
-        overlaps = [_iou(result.detection.box2d, request.box2d) for result in found]
-        if not overlaps or max(overlaps) < SAME_OBJECT_IOU:
+        boxes = torch.tensor([result.detection.box2d for result in found], dtype=torch.float64).reshape(-1, 4)
+        overlaps = box2d_iou(boxes, torch.tensor(request.box2d, dtype=torch.float64))
+        if not found or float(overlaps.max()) < SAME_OBJECT_IOU:
             raise InputError(f"{self.file}: no result of {request.frame_id} overlaps its box {request.box2d}")
-        result = found[int(np.argmax(overlaps))]
+        result = found[int(overlaps.argmax())]
         whole = _mask(result, request.image.shape[:2])
         unknown = occluded_pixels(request, request.window)
         car = whole[request.window.slices] & ~unknown
@@ -143,13 +146,6 @@ def _inside(found: Sequence[CocoResult], photo: Photo) -> list[Detection2D]:
         if box[2] - box[0] >= 1 and box[3] - box[1] >= 1:
             inside.append(Detection2D(box, result.detection.type, result.detection.score))
     return inside
-
-
-def _iou(a: Box2D, b: Box2D) -> float:
-    width, height = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
-    common = max(width, 0.0) * max(height, 0.0)
-    area = sum((box[2] - box[0]) * (box[3] - box[1]) for box in (a, b))
-    return common / (area - common)
 
 
 def _mask(result: CocoResult, shape: tuple[int, ...]) -> Bool[np.ndarray, "height width"]:

@@ -7,11 +7,12 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 
-from carstudio.dataset.candidates import crop_window, envelope_iou
+from carstudio.dataset.candidates import envelope_iou
 from carstudio.dataset.legacy_json.fields import LegacyRecord, parse_record
 from carstudio.dataset.legacy_json.names import DATASET_NAMES, LICENCES, Identity
 from carstudio.dataset.legacy_json.stream import RawInstance
 from carstudio.dataset.legacy_json.verbatim import Verbatim, pack_extra
+from carstudio.dataset.outlines import crop_window
 from carstudio.dataset.patch import MaskValue, PatchRecord
 from carstudio.dataset.sources.frame import CameraOffset, Vector3
 from carstudio.errors import InputError

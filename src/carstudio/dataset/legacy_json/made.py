@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from carstudio.dataset.candidates import crop_window
 from carstudio.dataset.legacy_json.convert import UNBOUNDED_PX, png_format
 from carstudio.dataset.legacy_json.names import DATASET_NAMES, name_patch
+from carstudio.dataset.outlines import crop_window
 from carstudio.dataset.patch import MaskValue, PatchRecord
 from carstudio.errors import InputError
 from carstudio.images import decode_image, encode_png

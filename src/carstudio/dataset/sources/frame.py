@@ -22,6 +22,7 @@ class LabelledObject:
     box_center: Vector3 | None = None  # m, OpenCV camera, camera_offset applied
     box_size: Vector3 | None = None  # length, height, width, m
     box_yaw: float | None = None  # rad, KITTI rotation_y
+    box_rotation: tuple[float, float, float, float] | None = None  # quaternion w, x, y, z where the box leans
     score_2d: float | None = None
     score_3d: float | None = None
     truncation: float | None = None
@@ -42,7 +43,13 @@ class Frame:
     intrinsics: tuple[float, float, float, float]  # fx, fy, cx, cy
     camera_offset: Vector3 = (0.0, 0.0, 0.0)  # m; X_camera = X_label_frame + camera_offset
     camera_source: str
-    objects: tuple[LabelledObject, ...]
+    objects: tuple[LabelledObject, ...]  # labelled, or those that a detector has found
+    labels: tuple[LabelledObject, ...] = ()  # the labelled ones, where `objects` are a detector's
+    patch_prefix: str = ""  # of the patch ids of a detector's boxes
+    instance_id: str | None = None  # of the photograph's one main car, where the source knows it
+    licence: str | None = None  # of this photograph, where it differs from the source's
+    extra: dict[str, Any] = field(default_factory=dict)  # what the source knows of the photograph
+    problems: tuple[str, ...] = ()  # what could not be had, one sentence each
 
 
 @dataclass(frozen=True)

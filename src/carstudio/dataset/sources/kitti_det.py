@@ -62,6 +62,7 @@ class KittiDetSource:
             intrinsics=calibration.intrinsics,
             camera_offset=calibration.camera_offset,
             camera_source="calib:P2",
+            patch_prefix=f"ko-{ref.stem}",
             objects=tuple(objects),
         )
 

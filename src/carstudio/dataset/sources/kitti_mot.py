@@ -71,6 +71,7 @@ class KittiMotSource:
             intrinsics=drive.calibration.intrinsics,
             camera_offset=drive.calibration.camera_offset,
             camera_source="calib:P2",
+            patch_prefix=f"km-{ref.sequence_id}-{ref.stem}",
             objects=tuple(objects),
         )
 

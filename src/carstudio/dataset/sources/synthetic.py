@@ -19,8 +19,8 @@ import numpy as np
 import torch
 
 from carstudio.dataset.build import judge_and_split, summarize
-from carstudio.dataset.candidates import crop_window
 from carstudio.dataset.filters import FilterRecipe
+from carstudio.dataset.outlines import crop_window
 from carstudio.dataset.patch import MaskValue, PatchRecord
 from carstudio.dataset.runs import is_made_already, write_run
 from carstudio.dataset.store import StoreWriter, open_store
