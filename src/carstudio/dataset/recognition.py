@@ -22,7 +22,7 @@ from carstudio.perception.results import (
 
 SAME_CAR_IOU = 0.5  # of a detection and the 2-D box of a 3-D box: PASCAL's match
 
-Pixels = UInt8[np.ndarray, "frame_height frame_width 3"]
+Pixels = UInt8[np.ndarray, "_ _ 3"]  # of photographs of different sizes
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def _with_objects(frame: Frame, detections: Sequence[Detection2D] | None) -> Fra
     if detections is None:
         return replace(frame, labels=frame.objects)
     areas = [(box[2] - box[0]) * (box[3] - box[1]) for box in (found.box2d for found in detections)]
-    own = areas.index(max(areas)) if frame.instance_id is not None else -1
+    own = areas.index(max(areas)) if areas and frame.instance_id is not None else -1
     objects = []
     for number, found in enumerate(detections):
         patch_id = f"{frame.patch_prefix}-{number:03d}"
