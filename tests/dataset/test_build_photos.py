@@ -329,6 +329,6 @@ def test_real_frames_as_plain_photographs(test_data: Path, tmp_path: Path) -> No
     }
     exact = build_photos(folder / "image_2", tmp_path / "exact", camera=f"calib:{folder}/calib", **options)
     assert exact.info()["kept"] >= 7
-    assert np.median([record.box_iou for record in exact.records() if record.box_iou is not None]) > 0.85
+    assert np.median([record.box_iou for record in exact.records() if record.box_iou is not None]) > 0.8
     rough = build_photos(folder / "image_2", tmp_path / "rough", camera="1500", **options)
     assert rough.info()["kept"] < exact.info()["kept"]
