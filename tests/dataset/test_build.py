@@ -10,10 +10,12 @@ import pyarrow.dataset
 import pytest
 import torch
 
-from carstudio.dataset.build import BuildConfig, build, judge_store, open_source
+from carstudio.dataset.build import BuildConfig, build, judge_store
 from carstudio.dataset.filters import FilterRecipe
+from carstudio.dataset.inputs import digest_of_inputs
 from carstudio.dataset.outlines import CORE_PARTS, core_hulls, crop_window, object_box, object_hull, occluder_hulls
 from carstudio.dataset.patch import MaskValue
+from carstudio.dataset.plans import input_places, open_source, plan_frames
 from carstudio.dataset.sources.frame import parse_frame_range
 from carstudio.dataset.store import PatchStore, open_store
 from carstudio.errors import InputError
@@ -21,7 +23,7 @@ from carstudio.geometry.box3d import envelope
 from carstudio.geometry.camera import Camera
 from carstudio.geometry.overlap import box2d_iou
 from carstudio.images import read_image
-from dataset.made_up_kitti import HEIGHT, WIDTH, made_up_kitti
+from dataset.made_up_kitti import HEIGHT, P2, WIDTH, made_up_kitti
 
 
 @pytest.fixture
@@ -285,3 +287,30 @@ def test_real_frames_hold_the_known_tracks(test_data: Path, tmp_path: Path) -> N
     assert late == {"km-0001-004", "km-0001-005"}
     assert summary.kept >= 30
     assert store.verify() == []
+
+
+def test_the_same_command_on_changed_inputs_is_not_done(tmp_path: Path) -> None:
+    """Done when nothing has changed; refused when a label or a photograph has, even by a digit."""
+    root = made_up_kitti(tmp_path / "kitti")
+    config = BuildConfig(source="kitti-mot", root=root, out=tmp_path / "s", workers=1)
+    first = build(config)
+    assert build(config).candidates == first.candidates
+    label = root / "training" / "label_02" / "0000.txt"
+    text = label.read_text()
+    label.write_text(text.replace("1.5 1.8 4.0", "1.5 1.8 4.1", 1))
+    with pytest.raises(InputError, match="finished"):
+        build(config)
+    label.write_text(text)
+    build(config)
+    (root / "training" / "image_02" / "0000" / "000009.png").write_bytes(b"")
+    with pytest.raises(InputError, match="finished"):
+        build(config)
+
+
+def test_an_interrupted_build_does_not_go_on_with_other_inputs(tmp_path: Path) -> None:
+    root = made_up_kitti(tmp_path / "kitti")
+    config = BuildConfig(source="kitti-mot", root=root, out=tmp_path / "s", workers=1)
+    keys = [plan_frames(config, digest_of_inputs(input_places(config))).resume_key for _ in range(2)]
+    assert keys[0] == keys[1]
+    (root / "training" / "calib" / "0000.txt").write_text(P2.replace("200", "201"))
+    assert plan_frames(config, digest_of_inputs(input_places(config))).resume_key != keys[0]

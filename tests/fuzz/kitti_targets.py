@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from carstudio.dataset.build import FrameJob
+from carstudio.dataset.plans import FrameJob
+from carstudio.dataset.recognition import Perception
 from carstudio.dataset.sources.kitti_det import open_kitti_det
 from carstudio.dataset.sources.kitti_format import (
     KittiLabel,
@@ -101,7 +102,7 @@ def read_frame(files: Files, folder: Path) -> None:
     """A frame on its way through the build: sound records and problems in words."""
     write_files(files, folder)
     source = open_kitti_det(folder)
-    result = FrameJob(source, GrabCutSegmenter(), ("Car",), frozenset())(source.refs[0])
+    result = FrameJob(source, Perception(GrabCutSegmenter()), ("Car",), frozenset())(source.refs[:1])
     for record in result.records:
         assert record_problems(record) == [], (record, record_problems(record))
         assert isinstance(json.loads(record.extra), dict)
