@@ -66,8 +66,8 @@ class BoxPromptSegmenter:
         pixels = loaded.preprocessing.pixels(image)
         if pixels.shape != (3, loaded.side, loaded.side):
             raise InputError(
-                f"{self.name}: its preprocessor_config.json makes pictures of {tuple(pixels.shape[1:])} px, its network "
-                f"expects {loaded.side} x {loaded.side}; take the file that belongs to the model"
+                f"{self.name}: its preprocessor_config.json makes pictures of {tuple(pixels.shape[1:])} px, its "
+                f"network expects {loaded.side} x {loaded.side}; take the file that belongs to the model"
             )
         with low_precision(self.precision, loaded.device):
             embedding = self.embed(loaded.network, pixels[None].to(loaded.device))

@@ -107,8 +107,8 @@ def _load(load: Callable[[], Any], name: str, spec: str) -> Any:
         ) from error
     except Exception as error:  # whatever a broken file makes transformers, safetensors or torch raise
         raise InputError(
-            f"{spec}:{name}: cannot be loaded ({type(error).__name__}: {_first_line(error)}); fetch the model again, or "
-            "name another one"
+            f"{spec}:{name}: cannot be loaded ({type(error).__name__}: {_first_line(error)}); fetch the model again, "
+            "or name another one"
         ) from error
 
 

@@ -48,9 +48,9 @@ class Preprocessing:
         if self.shortest is None:
             assert self.longest is not None, "one way to resize is given"
             factor = self.longest / max(size)
-            return int(size[0] * factor + 0.5), int(size[1] * factor + 0.5)
+            return max(1, int(size[0] * factor + 0.5)), max(1, int(size[1] * factor + 0.5))
         height, width = _by_shortest(size, self.shortest, self.longest)
-        return height - height % self.step, width - width % self.step
+        return max(self.step, height - height % self.step), max(self.step, width - width % self.step)
 
     def pixels(self, image: UInt8[np.ndarray, "height width 3"]) -> Float[Tensor, "3 rows columns"]:
         """What the network sees."""
@@ -91,7 +91,7 @@ def parse_preprocessing(config: Mapping[str, Any], *, name: str, step: int = 1) 
             scale=float(config.get("rescale_factor", 1 / 255)) if config.get("do_rescale", True) else 1.0,
             resample=int(Image.Resampling(config.get("resample", _BILINEAR))),
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"{name}: preprocessor_config.json: expected size (height and width, shortest_edge and longest_edge, or "
             f"longest_edge), image_mean, image_std and a Pillow filter, found {dict(config)}; take the file that "

@@ -7,9 +7,20 @@ from carstudio.perception.grabcut import GrabCutSegmenter
 from carstudio.perception.ground_truth import GroundTruthSegmenter
 from carstudio.perception.onnx_segmenter import OnnxSegmenter, open_session
 from carstudio.perception.precomputed import PrecomputedSegmenter
-from carstudio.perception.results import Segmenter
+from carstudio.perception.results import Detector, Segmenter
+from carstudio.perception.sam import DEFAULT_SAM, SamSegmenter, open_sam
+from carstudio.perception.sam2 import DEFAULT_SAM2, Sam2Segmenter, open_sam2
+from carstudio.perception.transformers_detector import DEFAULT_DETECTOR, TransformersDetector, open_detector
 
-SEGMENTER_SPECS = ("grabcut", "ground-truth", "onnx:FILE", "precomputed:FOLDER")
+DETECTOR_SPECS = ("transformers[:NAME_OR_FOLDER]",)
+SEGMENTER_SPECS = (
+    "grabcut",
+    "ground-truth",
+    "onnx:FILE",
+    "precomputed:FOLDER",
+    "sam[:NAME_OR_FOLDER]",
+    "sam2[:NAME_OR_FOLDER]",
+)
 
 
 def parse_spec(spec: str) -> tuple[str, str | None]:
@@ -20,9 +31,26 @@ def parse_spec(spec: str) -> tuple[str, str | None]:
     return kind, argument or None
 
 
+def make_detector(spec: str) -> Detector:
+    """The detector that `spec` names; `InputError` when it cannot work."""
+    kind, argument = parse_spec(spec)
+    if kind == "transformers":
+        return make_transformers_detector(argument)
+    raise InputError(f"detector {spec!r}: expected one of {', '.join(DETECTOR_SPECS)}")
+
+
+def make_transformers_detector(argument: str | None) -> TransformersDetector:
+    """A detector of transformers, loaded once on the CPU to see that it works."""
+    name = _expanded(argument, DEFAULT_DETECTOR)
+    open_detector.__wrapped__(name, "cpu")
+    return TransformersDetector(name)
+
+
 def make_segmenter(spec: str) -> Segmenter:
     """The segmenter that `spec` names; `InputError` when it cannot work (no such file, package missing)."""
     kind, argument = parse_spec(spec)
+    if kind in ("sam", "sam2"):
+        return _make_sam(kind, argument)
     if kind == "grabcut" and argument is None:
         return GrabCutSegmenter()
     if kind == "ground-truth" and argument is None:
@@ -35,3 +63,21 @@ def make_segmenter(spec: str) -> Segmenter:
             raise InputError(f"precomputed: no folder {argument}; expected one with PATCH_ID.png or FRAME_ID.png")
         return PrecomputedSegmenter(Path(argument))
     raise InputError(f"segmenter {spec!r}: expected one of {', '.join(SEGMENTER_SPECS)}")
+
+
+def _make_sam(kind: str, argument: str | None) -> SamSegmenter | Sam2Segmenter:
+    """Loaded once on the CPU to see that it works, and let go: the processes that use it load their own."""
+    if kind == "sam":
+        name = _expanded(argument, DEFAULT_SAM)
+        open_sam.__wrapped__(name, "cpu")
+        return SamSegmenter(name=name)
+    name = _expanded(argument, DEFAULT_SAM2)
+    open_sam2.__wrapped__(name, "cpu")
+    return Sam2Segmenter(name=name)
+
+
+def _expanded(argument: str | None, default: str) -> str:
+    """The argument with `~` for the home folder, or the default name."""
+    if argument is None:
+        return default
+    return str(Path(argument).expanduser()) if argument.startswith("~") else argument

@@ -120,8 +120,8 @@ class LoadedDetector:
         if logits.shape[-1] == self.num_classes:
             return logits.sigmoid()
         raise InputError(
-            f"{SPEC}:{self.name}: expected {self.num_classes} logits per box, as id2label has names, or one more, found "
-            f"{logits.shape[-1]}; give id2label of its config.json a name for each class"
+            f"{SPEC}:{self.name}: expected {self.num_classes} logits per box, as id2label has names, or one more, "
+            f"found {logits.shape[-1]}; give id2label of its config.json a name for each class"
         )
 
 

@@ -8,7 +8,7 @@ from carstudio.errors import InputError
 _NAMES = {
     "Car": "car, automobile, suv, sports car, race car, taxi, cab, limousine, jeep, sedan, hatchback, police car",
     "Van": "van, minivan, ambulance",
-    "Truck": "truck, pickup truck, pickup, heavy truck, fire truck, fire engine, garbage truck, tow truck, trailer truck",
+    "Truck": "truck, pickup truck, pickup, heavy truck, fire truck, fire engine, garbage truck, tow truck, lorry",
     "Bus": "bus, school bus, minibus",
 }
 VEHICLE_TYPES = {name: kind for kind, names in _NAMES.items() for name in names.split(", ")}
@@ -26,8 +26,8 @@ def vehicle_classes(names: Mapping[int, str], *, model: str) -> dict[int, str]:
     if not found:
         some = ", ".join(list(names.values())[:8])
         raise InputError(
-            f"{model}: none of its {len(names)} classes is a vehicle; expected names like car, truck, bus or van, found "
-            f"{some} ...; choose a detector trained on COCO or Objects365, or put class names into id2label of its "
-            "config.json"
+            f"{model}: none of its {len(names)} classes is a vehicle; expected names like car, truck, bus or van, "
+            f"found {some} ...; choose a detector trained on COCO or Objects365, or put class names into id2label "
+            "of its config.json"
         )
     return found
