@@ -66,7 +66,11 @@ def test_boxes_are_those_of_transformers(saved: tuple[str, nn.Module, Path]) -> 
     for item, boxes in zip(PHOTOS, detector.detect(PHOTOS), strict=True):
         height, width = item.image.shape[:2]
         expected = []
-        for name, score, box in by_transformers(network, kind, item, names):
+        theirs = by_transformers(network, kind, item, names)
+        # they keep as many answers as there are queries, and D-FINE's queries may give several each: the surest ones
+        least = min(score for _, score, _ in theirs) if kind == "dfine" else 0.05
+        boxes = [b for b in boxes if b.score >= least - 1e-6]
+        for name, score, box in theirs:
             x0, y0, x1, y1 = np.clip(box, 0, [width, height, width, height])
             if name in ("car", "truck", "bus") and score > 0.05 and x1 > x0 and y1 > y0:
                 expected.append((-score, name.capitalize(), [x0, y0, x1, y1]))
