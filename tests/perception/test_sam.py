@@ -12,8 +12,9 @@ from torch import nn
 from carstudio.errors import InputError
 from carstudio.perception.box_prompts import box_prompts
 from carstudio.perception.results import PhotoSegmenter, Segmenter
-from carstudio.perception.sam import DEFAULT_SAM, SamSegmenter, open_sam
+from carstudio.perception.sam import SamSegmenter, open_sam
 from carstudio.perception.specs import make_segmenter
+from carstudio.perception.weights import DEFAULT_SAM
 from perception.sam_cases import SHAPES, assert_same, boxes_of, direct, grown, photographs, requests_of
 from perception.tiny_hub import IMAGENET, SAM_SIDE, save_processor, save_sam, save_sam2
 

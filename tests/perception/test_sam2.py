@@ -9,8 +9,9 @@ import torch
 from torch import nn
 
 from carstudio.perception.results import PhotoSegmenter, Segmenter
-from carstudio.perception.sam2 import DEFAULT_SAM2, Sam2Segmenter
+from carstudio.perception.sam2 import Sam2Segmenter
 from carstudio.perception.specs import make_segmenter
+from carstudio.perception.weights import DEFAULT_SAM2
 from oracles.resize import bilinear, triangle_resize
 from perception.sam_cases import SHAPES, assert_same, boxes_of, direct, photographs, requests_of
 from perception.tiny_hub import IMAGENET, SAM_SIDE, save_sam2

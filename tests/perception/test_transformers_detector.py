@@ -13,13 +13,13 @@ from carstudio.errors import InputError
 from carstudio.perception.results import Detection2D, Detector, Photo
 from carstudio.perception.specs import make_detector
 from carstudio.perception.transformers_detector import (
-    DEFAULT_DETECTOR,
     TransformersDetector,
     edges_px,
     open_detector,
     without_doubles,
 )
 from carstudio.perception.vehicle_classes import vehicle_classes, vehicle_type
+from carstudio.perception.weights import DEFAULT_DETECTOR
 from perception.tiny_hub import photograph, save_dfine, save_processor, save_sam, save_yolos
 
 SHAPES = [(90, 160), (120, 100), (90, 160), (64, 64)]

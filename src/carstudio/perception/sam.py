@@ -14,9 +14,9 @@ from carstudio.devices import pick_device
 from carstudio.perception.box_prompts import BoxPromptSegmenter, LoadedSam, interpolate
 from carstudio.perception.hub_models import read_config, read_network, read_preprocessing
 from carstudio.perception.preprocessing import Size
+from carstudio.perception.weights import DEFAULT_SAM
 
 SPEC = "sam"
-DEFAULT_SAM = "facebook/sam-vit-huge"  # as the release; facebook/sam-vit-base is a seventh of its size
 
 
 @dataclass(frozen=True, kw_only=True)

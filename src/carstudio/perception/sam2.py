@@ -11,9 +11,9 @@ from carstudio.devices import pick_device
 from carstudio.perception.box_prompts import BoxPromptSegmenter, LoadedSam, interpolate
 from carstudio.perception.hub_models import read_config, read_network, read_preprocessing
 from carstudio.perception.preprocessing import Size
+from carstudio.perception.weights import DEFAULT_SAM2
 
 SPEC = "sam2"
-DEFAULT_SAM2 = "facebook/sam2.1-hiera-large"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,9 +8,10 @@ from carstudio.perception.ground_truth import GroundTruthSegmenter
 from carstudio.perception.onnx_segmenter import OnnxSegmenter, open_session
 from carstudio.perception.precomputed import PrecomputedSegmenter
 from carstudio.perception.results import Detector, Segmenter
-from carstudio.perception.sam import DEFAULT_SAM, SamSegmenter, open_sam
-from carstudio.perception.sam2 import DEFAULT_SAM2, Sam2Segmenter, open_sam2
-from carstudio.perception.transformers_detector import DEFAULT_DETECTOR, TransformersDetector, open_detector
+from carstudio.perception.sam import SamSegmenter, open_sam
+from carstudio.perception.sam2 import Sam2Segmenter, open_sam2
+from carstudio.perception.transformers_detector import TransformersDetector, open_detector
+from carstudio.perception.weights import DEFAULT_DETECTOR, DEFAULT_SAM, DEFAULT_SAM2
 
 DETECTOR_SPECS = ("transformers[:NAME_OR_FOLDER]",)
 SEGMENTER_SPECS = (

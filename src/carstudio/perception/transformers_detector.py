@@ -21,14 +21,9 @@ from carstudio.perception.hub_models import Precision, low_precision, read_confi
 from carstudio.perception.preprocessing import Preprocessing
 from carstudio.perception.results import Detection2D, Photo
 from carstudio.perception.vehicle_classes import vehicle_classes
+from carstudio.perception.weights import DEFAULT_DETECTOR
 
 SPEC = "transformers"
-DEFAULT_DETECTOR = "ustc-community/dfine-medium-obj2coco"
-"""D-FINE-M (Peng et al., ICLR 2025), trained on Objects365, then on COCO; Apache-2.0. Published COCO val AP, parameters
-and operations (the authors' tables): D-FINE-M 55.0 AP, 19 M, 57 GFLOPs; D-FINE-S 50.3 AP, 10 M, 25 GFLOPs (for slow
-CPUs: ustc-community/dfine-small-obj2coco); D-FINE-L 56.9 AP, 31 M, 91 GFLOPs; RT-DETRv2-S 48.1 AP, 20 M; RT-DETRv2-L
-53.4 AP, 42 M; RT-DETRv2-X 54.3 AP, 76 M. So it is more exact than the largest RT-DETRv2 with a quarter of its weights,
-and 79 MB to download. Its strength, refined box edges, is what the 2-D box filter and SAM's prompt live on."""
 _YOLOS_STEP = 16  # its image processor cuts the sides to multiples of this, and says so in no file
 _GPU_BATCH = 8
 
