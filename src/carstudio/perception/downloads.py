@@ -63,7 +63,7 @@ def _files(name: str) -> tuple[str, dict[str, int]]:
     from huggingface_hub.errors import GatedRepoError, HfHubHTTPError, HFValidationError, RepositoryNotFoundError
 
     try:
-        info = HfApi(endpoint=constants.ENDPOINT).model_info(name, files_metadata=True)
+        info = HfApi().model_info(name, files_metadata=True)
     except GatedRepoError as error:
         raise InputError(
             f"{name}: its owner wants you to agree to the licence first; do so at {constants.ENDPOINT}/{name}, "
@@ -100,7 +100,7 @@ def _fetch(name: str, file: str, *, revision: str, out: Path | None, report: Any
     # The commit only where it does not change what the cache knows as "main".
     place: dict[str, Any] = {} if out is None else {"local_dir": out, "revision": revision}
     try:
-        return Path(hf_hub_download(name, file, endpoint=constants.ENDPOINT, **place, **bar))
+        return Path(hf_hub_download(name, file, **place, **bar))
     except Exception as error:  # whatever the HTTP client raises
         if isinstance(error, OSError) and error.errno is not None:
             raise StorageError(out or constants.HF_HUB_CACHE, error.strerror) from error
@@ -119,7 +119,7 @@ def _counter(report: Report, name: str, before: int, total: int) -> type:
             super().__init__(*args, **{**kwargs, "disable": True})
             self.bytes = 0
 
-        def update(self, n: float | None = 1) -> None:
+        def update(self, n: Any = 1) -> None:
             self.bytes += int(n or 0)
             report(name, (before + self.bytes) // _MEGABYTE, max(1, total // _MEGABYTE), "MB")
 
