@@ -82,6 +82,16 @@ def test_old_forms_of_the_sizes_mean_the_same() -> None:
     assert old.mean == (0.485, 0.456, 0.406)
 
 
+def test_sizes_are_those_of_transformers() -> None:
+    from transformers.image_transforms import get_size_with_aspect_ratio
+
+    random = np.random.default_rng(0)
+    for height, width, shortest, more in random.integers(20, 1500, (3000, 4)).tolist():
+        ours = Preprocessing(shortest=shortest, longest=shortest + more).resized((height, width))
+        theirs = get_size_with_aspect_ratio((height, width), shortest, shortest + more)
+        assert ours == (max(1, theirs[0]), max(1, theirs[1])), (height, width, shortest, more)
+
+
 def test_padding_is_asked_for_twice() -> None:
     """Many files carry a `pad_size` that their `do_pad` switches off."""
     config = {"size": {"height": 8, "width": 8}, "pad_size": {"height": 9, "width": 9}}
