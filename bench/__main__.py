@@ -18,6 +18,7 @@ import torch
 
 from bench.patches import random_batch
 from carstudio.allocator import keep_freed_memory
+from carstudio.devices import pick_device
 from carstudio.geometry.orbit import orbit_camera
 from carstudio.models.interface import render_image
 from carstudio.models.zoo import build_model
@@ -25,7 +26,6 @@ from carstudio.recipes import recipe
 from carstudio.rendering.rays import to_canonical
 from carstudio.rendering.volume import composite
 from carstudio.training.batches import generator_for
-from carstudio.training.checkpoint import pick_device
 from carstudio.training.losses import training_loss
 from carstudio.training.precision import Precision, autocast, resolve_precision
 

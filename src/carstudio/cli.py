@@ -36,6 +36,8 @@ VERBS = {
     "evaluate": ("carstudio.commands.evaluate:Evaluate", "trained model + protocol -> result rows and their table"),
     "report": ("carstudio.commands.report:WriteReport", "trained model + store -> both protocols, pictures, one page"),
     "render": ("carstudio.commands.render:Render", "trained model + photos -> turntables, opacity, depth"),
+    "models": ("carstudio.commands.models:Models", "pretrained networks: which there are, which are here, download"),
+    "doctor": ("carstudio.commands.doctor:Doctor", "what is installed, what is missing, what it is for, how to get it"),
 }
 
 

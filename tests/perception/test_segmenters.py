@@ -153,8 +153,8 @@ def test_specs() -> None:
     for spec in ("", ":x", "onnx:"):
         with pytest.raises(InputError, match="expected KIND or KIND:ARGUMENT"):
             make_segmenter(spec)
-    for spec in ("onnx", "grabcut:fast", "sam"):
-        with pytest.raises(InputError, match="expected one of grabcut, ground-truth, onnx:FILE, precomputed:FOLDER"):
+    for spec in ("onnx", "grabcut:fast", "samurai"):
+        with pytest.raises(InputError, match="expected one of grabcut, sam"):
             make_segmenter(spec)
     with pytest.raises(InputError, match="precomputed: no folder nowhere"):
         make_segmenter("precomputed:nowhere")

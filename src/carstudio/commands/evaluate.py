@@ -8,13 +8,14 @@ import tyro
 
 from carstudio.commands.command import Outcome, Output, plain, provenance
 from carstudio.dataset.store import open_store
+from carstudio.devices import pick_device
 from carstudio.errors import InputError
 from carstudio.evaluation.protocols import EvaluationConfig, Protocol
 from carstudio.evaluation.scored_run import score_run
 from carstudio.evaluation.summary import summarise
 from carstudio.evaluation.tables import result_tables, to_markdown
 from carstudio.files import require_writable
-from carstudio.training.checkpoint import describe_model, load_model, pick_device
+from carstudio.training.checkpoint import describe_model, load_model
 
 
 @dataclass(frozen=True, kw_only=True)

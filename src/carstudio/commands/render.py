@@ -8,12 +8,13 @@ import tyro
 
 from carstudio.commands.command import Outcome, Output
 from carstudio.dataset.store import PatchStore, open_store
+from carstudio.devices import pick_device
 from carstudio.errors import InputError
 from carstudio.files import inside
 from carstudio.images import write_png
 from carstudio.report.panels import encode_patch, turntable
 from carstudio.report.video import write_gif, write_mp4
-from carstudio.training.checkpoint import load_model, pick_device
+from carstudio.training.checkpoint import load_model
 
 
 @dataclass(frozen=True, kw_only=True)

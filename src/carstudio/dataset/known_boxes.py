@@ -18,7 +18,7 @@ from carstudio.files import read_json
 from carstudio.geometry.transforms import quaternion_from_rotation, rotation_from_quaternion, yaw_from_rotation
 from carstudio.perception.results import BoxEstimator, Detection3D, Photo
 from carstudio.perception.specs import parse_spec
-from carstudio.perception.vehicles import vehicle_type
+from carstudio.perception.vehicle_classes import vehicle_type
 
 BOX3D_SPECS = ("labels", "none", "precomputed:FOLDER", "precomputed:FILE.json")
 UPRIGHT = 1e-4  # rad: a box that leans less is described by its yaw

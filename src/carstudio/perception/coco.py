@@ -22,7 +22,7 @@ from carstudio.geometry.overlap import box2d_iou
 from carstudio.perception.hulls import occluded_pixels
 from carstudio.perception.results import Box2D, Detection2D, MaskResult, Photo, SegmentRequest
 from carstudio.perception.rle import decode_rle
-from carstudio.perception.vehicles import COCO_CATEGORY_IDS, vehicle_type
+from carstudio.perception.vehicle_classes import COCO_CATEGORY_IDS, vehicle_type
 
 SAME_OBJECT_IOU = 0.5  # of a box asked for and the box that a mask was found with
 

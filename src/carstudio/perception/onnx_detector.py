@@ -19,7 +19,7 @@ from jaxtyping import Float, UInt8
 from carstudio.errors import InputError
 from carstudio.perception.onnx_session import first_line, start_session
 from carstudio.perception.results import Detection2D, Photo
-from carstudio.perception.vehicles import COCO_CLASS_NUMBERS
+from carstudio.perception.vehicle_classes import COCO_CLASS_NUMBERS
 
 STRIDES = (8, 16, 32)
 PADDING_GREY = 114

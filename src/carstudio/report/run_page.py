@@ -10,6 +10,7 @@ import numpy as np
 
 from carstudio.dataset.pixels import PreparedPatch
 from carstudio.dataset.store import PatchStore
+from carstudio.devices import pick_device
 from carstudio.evaluation.protocols import EvaluationConfig, Protocol, ScoredView, can_score
 from carstudio.evaluation.scored_run import ScoredRun, score_run
 from carstudio.evaluation.summary import Summary, summarise
@@ -24,7 +25,7 @@ from carstudio.report.panels import encode_patch, truth_on_black, turntable, vie
 from carstudio.report.plots import learning_curve
 from carstudio.report.sheets import Pixels, fit, side_by_side
 from carstudio.report.video import write_gif
-from carstudio.training.checkpoint import describe_model, load_model, pick_device
+from carstudio.training.checkpoint import describe_model, load_model
 from carstudio.training.log import read_log
 
 PROTOCOLS: tuple[Protocol, ...] = ("novel-view", "input-view")

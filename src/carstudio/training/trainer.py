@@ -12,6 +12,7 @@ import torch
 
 from carstudio.dataset.pixels import PatchCache
 from carstudio.dataset.store import PatchStore
+from carstudio.devices import pick_device
 from carstudio.errors import InputError, Interrupted
 from carstudio.files import remove_partials
 from carstudio.locks import LOCK_NAME, FolderLock
@@ -22,7 +23,7 @@ from carstudio.progress import Report, silent
 from carstudio.rendering.rays import to_canonical
 from carstudio.rendering.volume import composite
 from carstudio.training.batches import StepSampler, Supervision, generator_for
-from carstudio.training.checkpoint import describe_model, load_weights_of, pick_device, save_model
+from carstudio.training.checkpoint import describe_model, load_weights_of, save_model
 from carstudio.training.log import LOG, TrainingLog
 from carstudio.training.losses import LossConfig, masked_psnr, training_loss
 from carstudio.training.precision import Precision, autocast, resolve_precision

@@ -1,0 +1,99 @@
+"""`carstudio models list|download`: the pretrained networks, where they are, and how to carry them offline."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+
+from carstudio.commands.command import Outcome, Output, plain
+from carstudio.commands.tables import table
+from carstudio.errors import InputError
+from carstudio.files import read_json
+from carstudio.hub import is_in_cache
+from carstudio.perception.downloads import Downloaded, download
+from carstudio.perception.weights import ENCODER_OPTION, KNOWN_MODELS, full_name, option_for
+
+
+@dataclass(frozen=True, kw_only=True)
+class Models(Output):
+    """Show which pretrained networks are on this machine, or download some for machines that are offline later."""
+
+    action: tyro.conf.Positional[Literal["list", "download"]]
+    """list: the networks we know, and whether they are here; with folders: loads each and says how to use it.
+    download: fetch networks of the hub."""
+    names: tyro.conf.Positional[tuple[str, ...]] = ()
+    """download: names as on the hub (facebook/sam-vit-huge), or without the owner where we know them. list: folders."""
+    out: Path | None = None
+    """download: a folder to carry elsewhere (with several names one folder below it for each), not the hub's cache."""
+
+    def saved(self) -> str:
+        """Whole files are kept, and the part of the one that was on its way."""
+        return "what was downloaded is kept"
+
+    def run(self) -> Outcome:
+        """Do what `action` says."""
+        if self.action == "list":
+            if self.out is not None:
+                raise InputError("--out is for download, not for list")
+            return check_folders(self.names) if self.names else list_models()
+        if not self.names:
+            raise InputError("download needs a name, such as sam-vit-huge; `carstudio models list` shows them")
+        names = [full_name(name) for name in self.names]
+        with self.progress() as report:
+            fetched = [download(name, self._place(name), report) for name in names]
+        return Outcome("\n".join(_describe(item, self.out) for item in fetched), {"downloaded": plain(fetched)})
+
+    def _place(self, name: str) -> Path | None:
+        if self.out is None or len(self.names) == 1:
+            return self.out
+        return self.out / name.rpartition("/")[2]
+
+
+def _describe(item: Downloaded, out: Path | None) -> str:
+    option = option_for(item.name, item.name if out is None else str(item.folder))
+    use = f"; use it with {option}" if option else ""
+    return f"{item.name}: {item.num_bytes / 1e6:.1f} MB in {item.folder}{use}"
+
+
+def known_models() -> list[dict[str, Any]]:
+    """The table of known models with `is_here`, as JSON values."""
+    return [{**plain(model), "is_here": is_in_cache(model.name)} for model in KNOWN_MODELS]
+
+
+def list_models() -> Outcome:
+    """The known models and whether they are in the hub's cache."""
+    models = known_models()
+    rows = [
+        (m["name"], "yes" if m["is_here"] else "no", f"{m['megabytes']} MB", m["licence"], m["purpose"]) for m in models
+    ]
+    text = table(("name", "here", "download", "licence", "for"), rows)
+    how = "get one with: carstudio models download NAME    (others of the hub by their full name, OWNER/MODEL)"
+    return Outcome(f"{text}\n{how}", {"models": models})
+
+
+def check_folders(folders: tuple[str, ...]) -> Outcome:
+    """Load each folder as a build would; `InputError` at the first that cannot be used."""
+    options = {folder: option_of_folder(Path(folder).expanduser()) for folder in folders}
+    text = "\n".join(f"{folder}: whole; use it with {option}" for folder, option in options.items())
+    return Outcome(text, {"folders": options})
+
+
+def option_of_folder(folder: Path) -> str:
+    """The option that a folder with a network is for; `InputError` when the network cannot be loaded."""
+    from carstudio.models.encoders import ResNet34Encoder  # these take seconds to import: only where they are needed
+    from carstudio.perception.specs import make_detector, make_segmenter
+
+    if not (folder / "config.json").is_file():
+        raise InputError(f"{folder}: no config.json; expected a folder with a network as save_pretrained writes it")
+    settings = read_json(folder / "config.json")
+    kind = settings.get("model_type") if isinstance(settings, dict) else None
+    if kind == "resnet":
+        ResNet34Encoder().load_pretrained(str(folder))
+        return ENCODER_OPTION.format(folder)
+    if kind in ("sam", "sam2", "sam2_video"):
+        spec = f"{kind.removesuffix('_video')}:{folder}"
+        make_segmenter(spec)
+        return f"--segmenter {spec}"
+    make_detector(f"transformers:{folder}")
+    return f"--detector transformers:{folder}"
