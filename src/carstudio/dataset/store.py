@@ -40,6 +40,7 @@ __all__ = ["PatchStore", "StoreWriter", "open_store"]
 
 PARTS = ("train", "test")
 _VERDICTS_PER_GROUP = 4096
+_PATH = pa.struct([("path", pa.string())])  # a picture without its bytes
 _CACHED_GROUPS = 2  # row groups whose pictures are kept, so that reading in order decodes each group once
 
 
@@ -118,6 +119,13 @@ class PatchStore:
         with reading(self.path / "data"):
             table = pa.concat_tables([file.read(columns=columns) for file in self._files])
         return sound(table, REQUIRED, self.path / "data")
+
+    def have(self, picture: str) -> pa.ChunkedArray:
+        """Which candidates have the picture `image`, `mask` or `depth`, in store order; its bytes are not read."""
+        assert picture in PICTURES, picture
+        with reading(self.path / "data"):
+            tables = [file.read(columns=[f"{picture}.path"]) for file in self._files]
+        return pc.is_valid(pa.chunked_array([chunk for t in tables for chunk in t[picture].chunks], _PATH))
 
     @cached_property
     def _locations(self) -> dict[str, Location]:
