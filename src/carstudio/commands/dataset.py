@@ -9,9 +9,10 @@ import tyro
 from tyro.conf import subcommand
 
 from carstudio.commands.command import Outcome, Output
+from carstudio.commands.dataset_making import Duplicates, Merge, Split
 from carstudio.commands.dataset_out import DatasetReport, Export
-from carstudio.dataset.build import judge_store
 from carstudio.dataset.filters import FilterRecipe
+from carstudio.dataset.judging import judge_store
 from carstudio.dataset.runs import write_run
 from carstudio.dataset.splits import write_splits
 from carstudio.dataset.store import PatchStore, open_store
@@ -69,8 +70,8 @@ def refilter(store: PatchStore, recipe: FilterRecipe) -> Outcome:
     """Judge by stored values, replace verdicts and splits."""
     if not store.manifest.is_finished:
         raise InputError(f"{store.path}: the store is unfinished; run the command that wrote it again, then refilter")
-    write_run(store.path, {"refilter": asdict(recipe)})
     judge_store(store, recipe)
+    write_run(store.path, {"refilter": asdict(recipe)})
     splits = write_splits(open_store(store.path))
     reasons = store.info()["reasons"]
     lines = [f"{store.path}: {reasons.get('kept', 0)} of {len(store)} patches kept"]
@@ -84,6 +85,9 @@ Dataset = (
     Annotated[Info, subcommand("info")]
     | Annotated[Verify, subcommand("verify")]
     | Annotated[Refilter, subcommand("refilter")]
+    | Annotated[Merge, subcommand("merge")]
+    | Annotated[Split, subcommand("split")]
+    | Annotated[Duplicates, subcommand("duplicates")]
     | Annotated[Export, subcommand("export")]
     | Annotated[DatasetReport, subcommand("report")]
 )

@@ -34,6 +34,8 @@ class FilterRecipe:
     KITTI's own benchmark calls a match for cars."""
     need_box3d: bool = True
     """Reject patches without a 3-D box: nothing can be trained on them."""
+    drop_duplicates: bool = False
+    """Reject patches whose picture repeats a kept one's; `carstudio dataset duplicates` must have looked for them."""
 
 
 Filter = Callable[[PatchRecord, FilterRecipe], Check]

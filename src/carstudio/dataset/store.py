@@ -240,7 +240,7 @@ class PatchStore:
                 self._check_known((verdict.patch_id for verdict in some), "verdicts")
                 yield table_from_verdicts(some)
 
-        with self._writing():
+        with self.writing():
             write_tables(self.path / "verdicts.parquet", VERDICT_SCHEMA, tables())
 
     def split_names(self) -> list[str]:
@@ -269,10 +269,10 @@ class PatchStore:
         assert set(parts.values()) <= set(PARTS), set(parts.values())
         ids = [patch_id for patch_id in self._locations if patch_id in parts]
         table = pa.table({"patch_id": ids, "part": [parts[patch_id] for patch_id in ids]}, schema=_SPLIT_SCHEMA)
-        with self._writing():
+        with self.writing():
             write_tables(self.path / "splits" / f"{name}.parquet", _SPLIT_SCHEMA, [table])
 
-    def _writing(self) -> AbstractContextManager[object]:
+    def writing(self) -> AbstractContextManager[object]:
         """The store's lock, taken for one write unless its holder opened this store."""
         return nullcontext() if self._lock is not None and self._lock.is_held else FolderLock(self.path)
 
