@@ -137,7 +137,7 @@ def read_bounded(path: Path | str, what: str, *, max_bytes: int) -> bytes:
         raise InputError(f"{path}: {what} cannot be read ({reason}); replace or remove it") from error
     if max(size, len(data)) > max_bytes:
         found = max(size, len(data))
-        raise InputError(f"{path}: expected {what} of at most {max_bytes:,} bytes, found {found:,}; check the file")
+        raise InputError(f"{path}: {what} must be of at most {max_bytes:,} bytes, found {found:,}; check the file")
     return data
 
 

@@ -135,7 +135,7 @@ def read_image(path: Path | str, *, mode: str = "RGB") -> UInt8[np.ndarray, "hei
 
 def read_image_file(path: Path | str) -> bytes:
     """An encoded image as stored; `InputError` when it cannot be read or is larger than any image that is."""
-    return read_bounded(path, "an image", max_bytes=MAX_IMAGE_BYTES)
+    return read_bounded(path, "image", max_bytes=MAX_IMAGE_BYTES)
 
 
 def encode_png(pixels: Shaped[np.ndarray, "height width *channels"]) -> bytes:

@@ -233,7 +233,7 @@ def test_a_photo_that_may_not_be_read_costs_only_its_frame(tmp_path: Path) -> No
     root = made_up_kitti(tmp_path / "kitti")
     (root / "training" / "image_02" / "0000" / "000000.png").chmod(0)
     summary = build(BuildConfig(source="kitti-mot", root=root, out=tmp_path / "s", workers=1))
-    assert "000000.png: an image cannot be read (Permission denied)" in summary.problems[0]
+    assert "000000.png: image cannot be read (Permission denied)" in summary.problems[0]
 
 
 def test_a_photo_that_the_disk_does_not_give_costs_only_its_frame(
@@ -250,7 +250,7 @@ def test_a_photo_that_the_disk_does_not_give_costs_only_its_frame(
     monkeypatch.setattr(Path, "open", broken_disk)
     summary = build(BuildConfig(source="kitti-mot", root=root, out=tmp_path / "s", workers=1))
     assert summary.candidates == 1
-    assert "000000.png: an image cannot be read (Input/output error); replace or remove it" in summary.problems[0]
+    assert "000000.png: image cannot be read (Input/output error); replace or remove it" in summary.problems[0]
 
 
 def test_a_photo_file_of_absurd_length_is_refused(tmp_path: Path) -> None:
@@ -259,7 +259,7 @@ def test_a_photo_file_of_absurd_length_is_refused(tmp_path: Path) -> None:
     with (root / "training" / "image_02" / "0000" / "000000.png").open("wb") as file:
         file.truncate(2**36)
     summary = build(BuildConfig(source="kitti-mot", root=root, out=tmp_path / "s", workers=1))
-    assert "expected an image of at most 480,000,000 bytes, found 68,719,476,736" in summary.problems[0]
+    assert "image must be of at most 480,000,000 bytes, found 68,719,476,736" in summary.problems[0]
 
 
 def test_a_calibration_that_fails_in_one_frame_costs_only_that(tmp_path: Path) -> None:

@@ -187,4 +187,4 @@ def test_a_bomb_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     root = write_files(tmp_path, text_of)
     (root / "patch" / "bomb.png").write_bytes(b"\x89PNG\r\n\x1a\n" + header + pixels)
     summary = build_files(root, tmp_path / "store")
-    assert "at most 120000000" in summary.problems[0]
+    assert "at most 120,000,000" in summary.problems[0]

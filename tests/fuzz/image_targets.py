@@ -41,7 +41,7 @@ def image_seeds() -> list[Files]:
         _encoded(photo, "BMP"),
         _encoded(photo, "TIFF", compression="tiff_lzw"),
         _encoded(photo.convert("CMYK"), "TIFF", exif=exif),
-        _encoded(grey.convert("F"), "TIFF"),
+        _encoded(grey.convert("I;16"), "TIFF"),
         _encoded(photo, "WEBP", lossless=True),
         _encoded(photo, "WEBP", save_all=True, append_images=[photo.rotate(180)]),
     ]

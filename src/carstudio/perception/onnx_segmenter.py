@@ -17,6 +17,7 @@ from jaxtyping import Float, UInt8
 
 from carstudio.errors import InputError
 from carstudio.perception.hulls import allowed_pixels, clean_mask, enlarged_window, occluded_pixels, visible_height_px
+from carstudio.perception.onnx_session import first_line, start_session
 from carstudio.perception.results import MaskResult, SegmentRequest
 
 VOC_CAR = 7
@@ -66,22 +67,7 @@ def _padded(side: int) -> int:
 @lru_cache(maxsize=2)
 def open_session(file: str) -> Any:
     """An onnxruntime session on one CPU thread: the same bits however many processes run."""
-    try:
-        import onnxruntime
-    except ImportError as error:
-        raise InputError('onnx: needs onnxruntime; install it with: pip install "carstudio[onnx]"') from error
-    if not Path(file).is_file():
-        raise InputError(f"onnx: no file {file}; expected a segmentation network (onnx:FILE)")
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.log_severity_level = 3
-    try:
-        session = onnxruntime.InferenceSession(file, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime's exceptions share no public base class
-        raise InputError(f"{file}: expected an ONNX network, found something else ({error})") from error
-    if len(session.get_inputs()) != 1:
-        found = [item.name for item in session.get_inputs()]
-        raise InputError(f"{file}: expected one input, float32 [1, 3, height, width], found {found}")
+    session = start_session(file, "segmentation")
     shape = session.get_outputs()[0].shape
     if len(shape) != 4 or not isinstance(shape[1], int) or shape[1] <= VOC_CAR:
         raise InputError(f"{file}: expected an output [1, classes, height, width] with VOC's classes, found {shape}")
@@ -96,7 +82,7 @@ def _run(session: Any, images: Float[np.ndarray, "1 3 h w"], file: str) -> Float
     except Exception as error:  # onnxruntime's exceptions share no public base class
         raise InputError(
             f"{file}: expected a network that takes float32 [1, 3, height, width] with sides in steps of {_SIDE_STEP}, "
-            f"found one that fails on {list(images.shape)} ({str(error).splitlines()[0][:200]})"
+            f"found one that fails on {list(images.shape)} ({first_line(error)})"
         ) from error
     if output.ndim != 4 or output.shape[1] <= VOC_CAR or output.shape[2:] != images.shape[2:]:
         raise InputError(

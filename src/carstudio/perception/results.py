@@ -80,6 +80,7 @@ class SegmentRequest:
     occluders: tuple[Float[np.ndarray, "_ 2"], ...] = ()  # of nearer objects
     patch_id: str = ""
     frame_id: str = ""
+    photo_path: str = ""  # of the photograph, relative to the source's root, with forward slashes
     truth_mask: bytes | None = None  # PNG of the window, where the source knows the exact mask
 
 
