@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from carstudio.cli import run
+from carstudio.dataset.duplicates import find_duplicates
 from carstudio.dataset.measured import measure
 from carstudio.dataset.store import StoreWriter
 from carstudio.errors import InputError
@@ -55,6 +56,17 @@ def test_no_boxes_no_masks_no_patches(tmp_path: Path) -> None:
 def test_a_damaged_picture_is_shown_as_a_finding(tmp_path: Path) -> None:
     records = [made_up_record(0), made_up_record(1, image=b"\x89PNG none")]
     assert write_build_report(made_up_store(tmp_path / "s", records).path, tmp_path / "r").is_file()
+
+
+def test_duplicates_are_counted_and_shown(tmp_path: Path) -> None:
+    records = [made_up_record(i) for i in range(4)]
+    records.append(made_up_record(9, image=records[0].image, sha256=records[0].sha256))
+    store = made_up_store(tmp_path / "s", records)
+    assert "Nobody has looked" in write_build_report(store.path, tmp_path / "r").read_text(encoding="utf-8")
+    find_duplicates(store)
+    text = write_build_report(store.path, tmp_path / "r").read_text(encoding="utf-8")
+    assert "1 groups of like pictures: 2 patches are the same as another byte for byte, 0 nearly" in text
+    assert read_image(tmp_path / "r" / "pictures" / "duplicates.png").shape[1] == 8 + 2 * (208 + 8)
 
 
 def test_the_verb(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

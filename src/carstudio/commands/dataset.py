@@ -10,7 +10,7 @@ from tyro.conf import subcommand
 
 from carstudio.commands.command import Outcome, Output
 from carstudio.commands.dataset_making import Duplicates, Merge, Split
-from carstudio.commands.dataset_out import DatasetReport, Export
+from carstudio.commands.dataset_out import Card, DatasetReport, Export
 from carstudio.dataset.filters import FilterRecipe
 from carstudio.dataset.judging import judge_store
 from carstudio.dataset.runs import write_run
@@ -89,5 +89,6 @@ Dataset = (
     | Annotated[Split, subcommand("split")]
     | Annotated[Duplicates, subcommand("duplicates")]
     | Annotated[Export, subcommand("export")]
+    | Annotated[Card, subcommand("card")]
     | Annotated[DatasetReport, subcommand("report")]
 )

@@ -1,4 +1,4 @@
-"""`carstudio dataset export|report`: a store in other formats, and for reading."""
+"""`carstudio dataset export|card|report`: a store in other formats, and for reading."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,6 +7,10 @@ from typing import Literal
 import tyro
 
 from carstudio.commands.command import Outcome, Output, plain
+from carstudio.dataset.card import write_card
+from carstudio.dataset.export_coco import export_coco
+from carstudio.dataset.export_folder import Which
+from carstudio.dataset.export_kitti import export_kitti
 from carstudio.dataset.legacy_json.exporter import export_legacy
 from carstudio.dataset.store import open_store
 
@@ -19,9 +23,11 @@ class Export(Output):
     """The store."""
     out: Path
     """A new or empty folder."""
-    format: Literal["legacy-json"] = "legacy-json"
-    """CarPatch3D as the authors published it; what came from their files is written as it was."""
-    patches: Literal["kept", "all"] = "kept"
+    format: Literal["legacy-json", "coco", "kitti"] = "legacy-json"
+    """legacy-json: CarPatch3D as the authors published it; what came from their files is written as it was. coco:
+    images/ and annotations.json with masks as run lengths. kitti: image_2, label_2, calib. The pictures are the crops,
+    and all positions are in pixels of the crop."""
+    patches: Which = "kept"
     """Kept patches, or rejected ones too."""
 
     def saved(self) -> str:
@@ -31,10 +37,28 @@ class Export(Output):
     def run(self) -> Outcome:
         """Say what was written and what was left out."""
         with self.progress() as report:
-            summary = export_legacy(open_store(self.store), self.out, patches=self.patches, report=report)
+            export = {"legacy-json": export_legacy, "coco": export_coco, "kitti": export_kitti}[self.format]
+            summary = export(open_store(self.store), self.out, patches=self.patches, report=report)
         lines = [f"{summary.out / name}: {count} patches" for name, count in summary.files.items()]
         lines += [f"  left out: {count:6d}  {reason}" for reason, count in summary.left_out.items()]
         return Outcome("\n".join(lines), plain(summary))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Card(Output):
+    """Write README.md into the store: a Hugging Face dataset card with a ledger of sources and licences."""
+
+    store: tyro.conf.Positional[Path]
+    """The store."""
+    title: str = ""
+    """Its heading; the folder's name when empty."""
+    force: bool = False
+    """Replace a README.md that is there."""
+
+    def run(self) -> Outcome:
+        """Write the card."""
+        path = write_card(open_store(self.store), title=self.title, force=self.force)
+        return Outcome(f"the card is {path}", {"card": str(path)})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -74,7 +74,7 @@ def measure(store: PatchStore) -> Measured:
         **texts,
         reason=reason,
         is_kept=is_kept,
-        has_mask=store.have("mask").to_numpy(),
+        has_mask=pc.is_valid(store.picture_names("mask")).to_numpy(),
         values=checked | _columns(table),
         thresholds=thresholds,
     )
@@ -132,16 +132,13 @@ def _judgements(
     values, thresholds = {}, {}
     for one in pc.unique(name).to_pylist():
         chosen = pc.equal(name, one)
-        seen = _numbers(value.filter(chosen))
-        passed = np.asarray(is_passed.filter(chosen).to_numpy(), bool)
-        limits = np.unique(_numbers(threshold.filter(chosen)))
-        limits = limits[np.isfinite(limits)]
+        seen, asked = _numbers(value.filter(chosen)), _numbers(threshold.filter(chosen))
         values[one] = np.full(len(patch_ids), np.nan)
         values[one][row[np.asarray(chosen.to_numpy(), bool)]] = seen
-        if len(limits):
-            failed = seen[~passed & np.isfinite(seen)]
-            is_least = bool(np.median(failed) <= limits.mean()) if len(failed) else None
-            thresholds[one] = Threshold(tuple(map(float, limits)), is_least)
+        if np.isfinite(asked).any():
+            failed = ~np.asarray(is_passed.filter(chosen).to_numpy(), bool) & np.isfinite(seen)
+            is_least = bool((seen <= asked)[failed].mean() > 0.5) if failed.any() else None
+            thresholds[one] = Threshold(tuple(np.unique(asked[np.isfinite(asked)]).tolist()), is_least)
     return reason, is_kept, values, thresholds
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from carstudio.dataset.runs import write_run
+from carstudio.dataset.runs import read_configs, write_run
 from carstudio.dataset.splits import write_splits
 from carstudio.dataset.store import PatchStore, StoreWriter, open_store
 from carstudio.dataset.verdicts import VERDICT_SCHEMA, Verdict, verdicts_from_table
@@ -47,7 +47,8 @@ def merge_stores(paths: Sequence[Path], out: Path, *, report: Report = silent) -
     sources = sorted({source for store in stores for source in store.manifest.sources})
     key = hashlib.sha256("\n".join(store.data_sha256 for store in stores).encode()).hexdigest()
     with StoreWriter(out, source=sources, resume_key=f"merge-{key}") as writer:
-        write_run(out, {"merge": [str(path) for path in paths]})
+        configs = [config for path in paths for config in read_configs(path)]
+        write_run(out, {"merge": [str(path) for path in paths], "configs": configs})
         total, done = sum(map(len, stores)), 0
         for store in stores:
             for record in store.records():

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from carstudio.dataset.duplicates import read_duplicates
 from carstudio.dataset.measured import Measured, measure, reasons_in_order
 from carstudio.dataset.store import PatchStore, open_store
 from carstudio.dataset.verdicts import KEPT
@@ -26,7 +27,7 @@ from carstudio.report.build_tables import (
 )
 from carstudio.report.distributions import Distribution, histograms, viewpoint_rose
 from carstudio.report.page import KeyFigure, Page, Picture, Section, Text, write_page
-from carstudio.report.patch_sheets import reason_sheet
+from carstudio.report.patch_sheets import patches_sheet, reason_sheet, spread
 from carstudio.report.plots import bars
 
 # Value -> what a histogram of it is called, in the order of the page; other filters' values follow by their names.
@@ -49,6 +50,7 @@ TITLES = {
     "occlusion": "Occlusion (level)",
 }
 _NO_DISTRIBUTION = ("box3d", "type", "crop_width", "crop_height")
+MOST_PAIRS = 12  # of like pictures
 MOST_PROBLEMS = 200  # told on the page
 MOST_PICTURES = 1000  # per reason: a sheet is held in memory and in the page
 ROSE_NOTE = (
@@ -97,6 +99,7 @@ def write_build_report(
             *([_distributions(measured, album), _viewpoints(measured, album)] if len(measured) else []),
             Section(title="Dataset", blocks=[*dataset_tables(measured), licence_table(measured)]),
             _cameras(measured, album),
+            *_duplicates(store, measured, album),
             *_sheets(store, measured, album, config, report),
             *_problems(problems),
         ],
@@ -198,6 +201,29 @@ def _cameras(measured: Measured, album: Album) -> Section:
         caption = "How far 2-D box and projected 3-D box agree, per kind of camera"
         blocks.append(album.add("cameras", histograms(shown), caption=caption))
     return Section(title="Cameras", blocks=[camera_table(measured), *blocks])
+
+
+def _duplicates(store: PatchStore, measured: Measured, album: Album) -> list[Section]:
+    """Counts, and the first groups of like pictures side by side; nothing where nobody has looked for them."""
+    found = read_duplicates(store)
+    if found is None:
+        return [
+            Section(title="Duplicates", blocks=[Text("Nobody has looked for them: `carstudio dataset duplicates`.")])
+        ]
+    told = (
+        "{groups:,} groups of like pictures: {exact:,} patches are the same as another byte for byte, {near:,} nearly."
+    )
+    blocks: list[Text | Picture] = [Text(f"{told.format(**found.counts())} A group is on one side of every split.")]
+    groups: dict[int, list[int]] = {}
+    places = {patch_id: index for index, patch_id in enumerate(measured.patch_id.tolist())}
+    for patch_id, number in found.groups().items():
+        groups.setdefault(number, []).append(places[patch_id])
+    chosen = [list(groups.values())[i][:2] for i in spread(len(groups), MOST_PAIRS)]
+    sheet = patches_sheet(store, measured, [index for pair in chosen for index in pair])
+    if sheet is not None:
+        caption = f"Two patches each of {len(chosen)} groups, evenly spread; pairs stand side by side"
+        blocks.append(album.add("duplicates", encode_png(sheet), caption=caption))
+    return [Section(title="Duplicates", blocks=blocks)]
 
 
 def _sheets(
