@@ -34,6 +34,8 @@ def overlay(record: PatchRecord) -> Pixels:
     """A patch enlarged, with mask, 2-D box and 3-D box; a margin in grey shows what leaves the crop."""
     patch = record.decode()
     height, width = patch.image.shape[:2]
+    if patch.mask.shape != (height, width) or (width, height) != (record.crop_width, record.crop_height):
+        raise InputError(f"image, mask and crop of patch {record.patch_id} differ in size; run `dataset verify`")
     picture = patch.image if record.mask is None else draw_mask(patch.image, patch.mask, strength=0.25)
     scale = max(ENLARGED_PX / max(height, width), 1e-3)
     size = max(1, round(width * scale)), max(1, round(height * scale))
