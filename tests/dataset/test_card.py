@@ -62,6 +62,7 @@ def test_no_warning_without_kitti(tmp_path: Path) -> None:
         ({"CC-BY-4.0"}, "cc-by-4.0"),
         ({"CC-BY-NC-4.0"}, "cc-by-nc-4.0"),
         ({"proprietary"}, "other"),
+        ({"MITRE"}, "other"),
         ({"MIT", "CC0-1.0"}, "other"),
         (set(), "other"),
     ],

@@ -15,7 +15,7 @@ from carstudio.errors import InputError
 from carstudio.files import write_text
 
 SIZES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"), (1_000_000, "100K<n<1M"))
-# Beginnings of the licences in stores -> their names on the Hub; the longest that fits counts.
+# First word of a licence in a store -> its name on the Hub.
 HUB_LICENCES = {
     "CC-BY-NC-SA-3.0": "cc-by-nc-sa-3.0",
     "CC-BY-NC-SA-4.0": "cc-by-nc-sa-4.0",
@@ -70,9 +70,7 @@ def hub_licence(licences: set[str]) -> str:
     if len(licences) != 1:
         return "other"
     (licence,) = licences
-    return next(
-        (HUB_LICENCES[name] for name in sorted(HUB_LICENCES, key=len)[::-1] if licence.startswith(name)), "other"
-    )
+    return HUB_LICENCES.get(licence.split(" ")[0], "other")
 
 
 def _header(measured: Measured, store: PatchStore) -> str:

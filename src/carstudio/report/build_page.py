@@ -208,7 +208,7 @@ def _duplicates(store: PatchStore, measured: Measured, album: Album) -> list[Sec
     found = read_duplicates(store)
     if found is None:
         return [
-            Section(title="Duplicates", blocks=[Text("Nobody has looked for them: `carstudio dataset duplicates`.")])
+            Section(title="Duplicates", blocks=[Text("Nobody has looked for them; carstudio dataset duplicates does.")])
         ]
     told = (
         "{groups:,} groups of like pictures: {exact:,} patches are the same as another byte for byte, {near:,} nearly."

@@ -109,8 +109,8 @@ def camera_sentence(measured: Measured) -> str:
         return "All intrinsics come from a calibration or are exact."
     sentence = (
         f"The camera of {int(rough.sum()):,} of {len(measured):,} patches is rough: its focal length was read from the "
-        "photo's EXIF or assumed from the photo's size, not calibrated. Depth and size of a 3-D box are then wrong by "
-        "about the same share as the focal length."
+        "photo's EXIF or assumed from the photo's size, not calibrated. The depth of a 3-D box is then wrong by about "
+        "the same share as the focal length."
     )
     iou = measured.values["box_iou"][rough]
     iou = iou[np.isfinite(iou)]

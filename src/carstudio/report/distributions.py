@@ -41,7 +41,7 @@ class Distribution:
 
 
 def bin_edges(values: Values, thresholds: Sequence[float] = (), bins: int = BINS) -> Float[np.ndarray, " _edges"]:
-    """Equal bins over the finite values without their tails; every threshold lies inside and on an edge where one does.
+    """Equal bins over the finite values without their tails; all thresholds lie well inside, the first on an edge.
 
     Whole numbers that are few (levels of occlusion) get a bin each.
     """
@@ -57,6 +57,7 @@ def bin_edges(values: Values, thresholds: Sequence[float] = (), bins: int = BINS
     step = (high - low) / bins
     if not len(thresholds):
         return low + step * np.arange(bins + 1)
+    low, high = min([low, *(t - 2 * step for t in thresholds)]), max([high, *(t + 2 * step for t in thresholds)])
     start = thresholds[0] - step * np.ceil((thresholds[0] - low) / step - 1e-9)
     return start + step * np.arange(int(np.ceil((high - start) / step - 1e-9)) + 1)
 

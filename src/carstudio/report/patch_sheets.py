@@ -59,7 +59,8 @@ def caption(record: PatchRecord, measured: Measured, index: int) -> str:
     lines = [record.patch_id]
     if reason == KEPT:
         shown = [("IoU", "box_iou"), ("mask", "mask_ratio")]
-        lines.append(", ".join(f"{label} {measured.values[name][index]:.2f}" for label, name in shown))
+        values = [(label, measured.values[name][index]) for label, name in shown]
+        lines.append(", ".join(f"{label} {value:.2f}" for label, value in values if np.isfinite(value)))
     else:
         value = measured.values.get(reason, np.full(len(measured), np.nan))[index]
         limit = measured.thresholds.get(reason)
@@ -67,7 +68,7 @@ def caption(record: PatchRecord, measured: Measured, index: int) -> str:
         asked = " or ".join(f"{value:g}" for value in limit.values) if limit is not None else ""
         lines.append(f"{reason} {value:.3g}, limit {asked}" if has_value else reason)
     lacking = [name for name, lacks in (("no mask", record.mask is None), ("no 3-D box", record.box is None)) if lacks]
-    return "\n".join([*lines, ", ".join(lacking)] if lacking else lines)
+    return "\n".join(line for line in (*lines, ", ".join(lacking)) if line)
 
 
 def reason_sheet(
