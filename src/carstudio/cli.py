@@ -30,7 +30,7 @@ VERBS = {
     "build": ("carstudio.commands.build:Build", "KITTI-DET, KITTI-MOT or the authors' json -> CarPatch3D"),
     "dataset": (
         "carstudio.commands.dataset:Dataset",
-        "CarPatch3D -> counts, a check of every byte, new verdicts, the authors' format",
+        "CarPatch3D -> counts, checks, verdicts, splits, duplicates, other formats, an HTML report",
     ),
     "train": ("carstudio.commands.train:Train", "recipe + CarPatch3D -> trained model"),
     "evaluate": ("carstudio.commands.evaluate:Evaluate", "trained model + protocol -> result rows and their table"),

@@ -36,10 +36,15 @@ def test_help_names_every_verb(capsys: pytest.CaptureFixture[str]) -> None:
     assert all(f"  {verb}" in shown for verb in VERBS)
 
 
-@pytest.mark.parametrize("verb", VERBS)
-def test_every_verb_explains_itself(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+ACTIONS = ("info", "verify", "refilter", "merge", "split", "duplicates", "export", "card", "report")
+
+
+@pytest.mark.parametrize(
+    "words", [[verb] for verb in VERBS if verb != "dataset"] + [["dataset", action] for action in ACTIONS]
+)
+def test_every_verb_explains_itself(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
-        run([verb, "--help"])
+        run([*words, "--help"])
     assert stop.value.code == 0
     assert "--json" in capsys.readouterr().out
 

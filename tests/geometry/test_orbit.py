@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from carstudio.geometry.box3d import envelope
-from carstudio.geometry.orbit import orbit_box, orbit_camera, orbit_distance
+from carstudio.geometry.box3d import Box3D, envelope
+from carstudio.geometry.orbit import orbit_box, orbit_camera, orbit_distance, viewing_angles
+from carstudio.geometry.transforms import rotation_y
 
 SIZE = torch.tensor([4.2, 1.5, 1.8], dtype=torch.float64)
 AZIMUTHS, ELEVATIONS = st.floats(-360, 360), st.floats(-90, 90)
@@ -65,3 +66,20 @@ def test_the_bounding_sphere_fills_the_share_that_was_asked_for():
 def test_the_focal_length_spans_the_field_of_view():
     camera = orbit_camera(100, field_of_view_deg=90.0)
     assert camera.intrinsics.tolist() == pytest.approx([50, 50, 50, 50])
+
+
+@given(AZIMUTHS, st.floats(-89, 89))
+def test_viewing_angles_turn_the_orbit_round(azimuth, elevation):
+    box = orbit_box(SIZE, azimuth_deg=azimuth, elevation_deg=elevation, distance_m=8.0)
+    seen_azimuth, seen_elevation = viewing_angles(box)
+    assert math.remainder(float(seen_azimuth) - math.radians(azimuth), 2 * math.pi) == pytest.approx(0, abs=1e-9)
+    assert float(seen_elevation) == pytest.approx(math.radians(elevation), abs=1e-9)
+
+
+def test_viewing_angles_of_a_batch_by_hand():
+    """A car that drives away, left of us, 1 m lower than the camera: seen from the rear right."""
+    rotation = rotation_y(torch.tensor([-math.pi / 2, math.pi / 2], dtype=torch.float64))
+    center = torch.tensor([[-10.0, 1.0, 10.0]], dtype=torch.float64).expand(2, 3)
+    azimuth, elevation = viewing_angles(Box3D(center, SIZE.expand(2, 3), rotation))
+    np.testing.assert_allclose(np.degrees(azimuth.numpy()), [-135.0, 45.0], atol=1e-9)
+    np.testing.assert_allclose(elevation.numpy(), np.arctan2(1.0, np.hypot(10, 10)), atol=1e-12)

@@ -45,6 +45,8 @@ class FilterRecipe:
     (released for DVM-Cars, whose photographs are of 300 x 300 px)."""
     need_box3d: bool = True
     """Reject patches without a 3-D box: nothing can be trained on them."""
+    drop_duplicates: bool = False
+    """Reject patches whose picture repeats a kept one's; `carstudio dataset duplicates` must have looked for them."""
 
 
 DVM_CARS = FilterRecipe(width_px=64.0, centred=True)

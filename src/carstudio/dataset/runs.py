@@ -50,6 +50,25 @@ def is_made_already(store_path: Path | str, config: dict[str, Any]) -> bool:
     return is_same_version and found == wanted
 
 
+def read_configs(store_path: Path | str) -> list[dict[str, Any]]:
+    """Settings of all runs that wrote here, those of the stores that were merged included.
+
+    A run file that is none is skipped: `runs/` is not part of the data.
+    """
+    found: list[dict[str, Any]] = []
+    for path in sorted((Path(store_path) / "runs").glob("[0-9]*.json")):
+        try:
+            config = read_json(path)["config"]
+        except (InputError, KeyError, TypeError):
+            continue
+        if isinstance(config, dict):
+            merged = config.get("configs", [])
+            found += (
+                [config, *(one for one in merged if isinstance(one, dict))] if isinstance(merged, list) else [config]
+            )
+    return found
+
+
 def _as_json(config: dict[str, Any]) -> dict[str, Any]:
     value: dict[str, Any] = json.loads(json.dumps(config, default=str))
     return value

@@ -25,7 +25,7 @@ _FLOATS = (
 )  # fmt: skip
 SAFE_ID_PATTERN = r"\A[A-Za-z0-9](?:[A-Za-z0-9._-]{0,98}[A-Za-z0-9_-])?\z"  # in RE2's words, which Arrow speaks
 _SAFE_ID = re.compile(SAFE_ID_PATTERN.replace(r"\z", r"\Z"))
-_JPEG_MAGIC = b"\xff\xd8"
+JPEG_MAGIC = b"\xff\xd8"
 
 
 def _arrow_type(name: str) -> pa.DataType:
@@ -69,7 +69,7 @@ def check_id(value: str, what: str) -> str:
 def _picture_cell(data: bytes | None, patch_id: str) -> dict[str, Any] | None:
     if data is None:
         return None
-    suffix = "jpg" if data.startswith(_JPEG_MAGIC) else "png"
+    suffix = "jpg" if data.startswith(JPEG_MAGIC) else "png"
     return {"bytes": data, "path": f"{patch_id}.{suffix}"}
 
 

@@ -3,15 +3,21 @@
 - `instance`: no car on both sides (zero-shot).
 - `view`: the same cars, later views held out (multi-view, test-time optimisation).
 - `released-patch`: the released code's split by patch in store order; the same car stands on both sides.
+
+Pictures that repeat each other (`duplicates.parquet`, where somebody has looked) are on one side of every split but the
+released one.
 """
 
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+
+from carstudio.dataset.duplicates import read_duplicates
+from carstudio.errors import InputError
 
 if TYPE_CHECKING:
     from carstudio.dataset.store import PatchStore
@@ -28,6 +34,8 @@ class View:
     patch_id: str
     instance_id: str
     order: int
+    sequence_id: str | None = None
+    duplicates: int | None = None  # the group of pictures that it repeats or that repeat it
 
 
 Parts = dict[str, str]  # patch_id -> "train" | "test"
@@ -36,29 +44,81 @@ Parts = dict[str, str]  # patch_id -> "train" | "test"
 def split_by_instance(views: Sequence[View], test_fraction: float = TEST_FRACTION, salt: str = "instance") -> Parts:
     """The ceil(fraction * n) instances with the smallest hash of their id are tested; one instance alone is trained on.
 
-    Hashes instead of a generator: adding cars to a store moves few of the others to the other side.
+    Hashes instead of a generator: adding cars to a store moves few of the others to the other side. Cars that share a
+    picture count as one.
     """
-    instances = sorted({view.instance_id for view in views}, key=lambda name: _hash(f"{salt}:{name}"))
-    num_test = math.ceil(test_fraction * len(instances) - 1e-9) if len(instances) > 1 else 0
-    tested = set(instances[:num_test])
-    return {view.patch_id: "test" if view.instance_id in tested else "train" for view in views}
+    return split_by_unit(views, [view.instance_id for view in views], test_fraction=test_fraction, salt=salt)
+
+
+def split_by_unit(views: Sequence[View], units: Sequence[str], *, test_fraction: float, salt: str) -> Parts:
+    """As `split_by_instance`, of whatever must not be parted: `units` names it for each view."""
+    names = join_units(units, [view.duplicates for view in views])
+    ranked = sorted(set(names), key=lambda name: _hash(f"{salt}:{name}"))
+    num_test = math.ceil(test_fraction * len(ranked) - 1e-9) if len(ranked) > 1 else 0
+    tested = set(ranked[:num_test])
+    return {view.patch_id: "test" if name in tested else "train" for view, name in zip(views, names, strict=True)}
+
+
+def join_units(units: Sequence[str], groups: Sequence[int | None]) -> list[str]:
+    """Units that have a group in common become one, under the name that is first in the alphabet."""
+    parent: dict[str | int, str | int] = {}
+
+    def root(name: str | int) -> str | int:
+        parent.setdefault(name, name)
+        while parent[name] != name:
+            parent[name] = name = parent[parent[name]]
+        return name
+
+    for unit, group in zip(units, groups, strict=True):
+        if group is not None:
+            parent[root(group)] = root(unit)
+    first: dict[str | int, str] = {}
+    for unit in units:
+        first[root(unit)] = min(unit, first.get(root(unit), unit))
+    return [first[root(unit)] for unit in units]
 
 
 def _hash(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def split_by_view(views: Sequence[View]) -> Parts:
-    """Of each instance the first two thirds of its views in time order train, the rest test; a single view trains."""
+def split_by_view(views: Sequence[View], train_fraction: float = VIEW_TRAIN_FRACTION) -> Parts:
+    """Of each instance the first two thirds of its views in time order train, the rest test; a single view trains.
+
+    A view to be tested that repeats a training view's picture trains instead.
+    """
     parts: Parts = {}
     by_instance: dict[str, list[View]] = {}
     for view in views:
         by_instance.setdefault(view.instance_id, []).append(view)
     for members in by_instance.values():
-        num_train = max(1, math.floor(VIEW_TRAIN_FRACTION * len(members) + 1e-9))
+        num_train = max(1, math.floor(train_fraction * len(members) + 1e-9))
         for rank, view in enumerate(sorted(members, key=lambda view: (view.order, view.patch_id))):
             parts[view.patch_id] = "train" if rank < num_train else "test"
-    return parts
+    trained = {view.duplicates for view in views if parts[view.patch_id] == "train"} - {None}
+    return parts | {view.patch_id: "train" for view in views if view.duplicates in trained}
+
+
+SplitBy = Literal["instance", "view", "sequence", "patch"]
+
+
+def make_split(views: Sequence[View], *, by: SplitBy, test_share: float = TEST_FRACTION, seed: int = 0) -> Parts:
+    """A split of one's own: `test_share` of the cars, sequences or patches, or of each car's views (the last in time).
+
+    Seed 0 by instance is the standard split `instance`. By view there is nothing to draw: the seed changes nothing.
+    """
+    if not 0 < test_share < 1:
+        raise InputError(f"--test-share must be above 0 and below 1, found {test_share}")
+    if by == "view":
+        return split_by_view(views, 1 - test_share)
+    units = [{"instance": view.instance_id, "patch": view.patch_id}.get(by, view.sequence_id) for view in views]
+    without = [view.patch_id for view, unit in zip(views, units, strict=True) if unit is None]
+    if without:
+        raise InputError(
+            f"{len(without)} kept patches belong to no sequence, {without[0]} among them; split by instance instead"
+        )
+    salt = by if seed == 0 else f"{by}-{seed}"
+    return split_by_unit(views, [str(unit) for unit in units], test_fraction=test_share, salt=salt)
 
 
 def split_as_released(views: Sequence[View]) -> Parts:
@@ -87,11 +147,13 @@ def write_splits(store: "PatchStore") -> dict[str, dict[str, int]]:
 def kept_views(store: "PatchStore") -> list[View]:
     """The kept patches in store order; time order is the frame index where there is one, else the store's."""
     kept = set(store.patch_ids())
-    table = store.table(["patch_id", "instance_id", "frame_index"])
+    found = read_duplicates(store)
+    groups = {} if found is None else found.groups()
+    table = store.table(["patch_id", "instance_id", "frame_index", "sequence_id"])
     rows = zip(*(table[name].to_pylist() for name in table.column_names), strict=True)
     return [
-        View(patch_id, instance_id, rank if frame_index is None else frame_index)
-        for rank, (patch_id, instance_id, frame_index) in enumerate(rows)
+        View(patch_id, instance_id, rank if frame_index is None else frame_index, sequence_id, groups.get(patch_id))
+        for rank, (patch_id, instance_id, frame_index, sequence_id) in enumerate(rows)
         if patch_id in kept
     ]
 

@@ -3,7 +3,6 @@
 `data/` holds every candidate and never changes; verdicts and splits lie beside it, keyed by patch_id.
 """
 
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property, lru_cache
@@ -15,6 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from carstudio.dataset.info import store_info
 from carstudio.dataset.manifest import Manifest, data_sha256, read_manifest
 from carstudio.dataset.patch import Patch, PatchRecord
 from carstudio.dataset.reading import open_parquet, reading, sound
@@ -29,7 +29,6 @@ from carstudio.dataset.schema import (
     record_from_row,
 )
 from carstudio.dataset.soundness import value_problems
-from carstudio.dataset.summary import sort_reasons
 from carstudio.dataset.verdicts import VERDICT_SCHEMA, Verdict, table_from_verdicts, verdicts_from_table
 from carstudio.dataset.verify import verify_store
 from carstudio.dataset.writer import StoreWriter, describe_shard, shard_paths, write_tables
@@ -118,6 +117,14 @@ class PatchStore:
         with reading(self.path / "data"):
             table = pa.concat_tables([file.read(columns=columns) for file in self._files])
         return sound(table, REQUIRED, self.path / "data")
+
+    def picture_names(self, picture: str) -> pa.ChunkedArray:
+        """File names of the candidates' `image`, `mask` or `depth`, null where there is none; no bytes are read."""
+        assert picture in PICTURES, picture
+        with reading(self.path / "data"):
+            tables = [file.read(columns=[f"{picture}.path"]) for file in self._files]
+        chunks = [pc.struct_field(chunk, "path") for table in tables for chunk in table[picture].chunks]
+        return pa.chunked_array(chunks, pa.string())
 
     @cached_property
     def _locations(self) -> dict[str, Location]:
@@ -232,7 +239,7 @@ class PatchStore:
                 self._check_known((verdict.patch_id for verdict in some), "verdicts")
                 yield table_from_verdicts(some)
 
-        with self._writing():
+        with self.writing():
             write_tables(self.path / "verdicts.parquet", VERDICT_SCHEMA, tables())
 
     def split_names(self) -> list[str]:
@@ -261,10 +268,10 @@ class PatchStore:
         assert set(parts.values()) <= set(PARTS), set(parts.values())
         ids = [patch_id for patch_id in self._locations if patch_id in parts]
         table = pa.table({"patch_id": ids, "part": [parts[patch_id] for patch_id in ids]}, schema=_SPLIT_SCHEMA)
-        with self._writing():
+        with self.writing():
             write_tables(self.path / "splits" / f"{name}.parquet", _SPLIT_SCHEMA, [table])
 
-    def _writing(self) -> AbstractContextManager[object]:
+    def writing(self) -> AbstractContextManager[object]:
         """The store's lock, taken for one write unless its holder opened this store."""
         return nullcontext() if self._lock is not None and self._lock.is_held else FolderLock(self.path)
 
@@ -280,31 +287,8 @@ class PatchStore:
         return verify_store(self)
 
     def info(self) -> dict[str, Any]:
-        """Counts: patches, instances, per source, per verdict reason, splits, sizes."""
-        table = self.table(["patch_id", "instance_id", "source", "licence", "crop_height"])
-        reasons = _counts(self.verdict_columns("reason")["reason"])
-        kept = table.filter(pc.invert(pc.is_in(table["patch_id"], self._rejected().combine_chunks())))
-        heights: Counter[int] = Counter()
-        for height, count in _counts(table["crop_height"]).items():
-            heights[32 * (height // 32)] += count
-        return {
-            "path": str(self.path),
-            "format_version": self.manifest.format_version,
-            "is_finished": self.manifest.is_finished,
-            "data_sha256": self.data_sha256,
-            "patches": len(self),
-            "kept": len(kept),
-            "instances": pc.count_distinct(table["instance_id"]).as_py(),
-            "kept_instances": pc.count_distinct(kept["instance_id"]).as_py(),
-            "sources": dict(sorted(_counts(table["source"]).items())),
-            "licences": dict(sorted(_counts(table["licence"]).items())),
-            "reasons": sort_reasons(reasons),
-            "unjudged": len(self) - sum(reasons.values()),
-            "splits": {
-                name: dict(sorted(_counts(self._split_table(name)["part"]).items())) for name in self.split_names()
-            },
-            "crop_height_px": {f"{low}-{low + 31}": heights[low] for low in sorted(heights)},
-        }
+        """Counts: patches, instances, per source, licence, camera and verdict reason, splits, sizes."""
+        return store_info(self)
 
 
 _SPLIT_SCHEMA = pa.schema(
@@ -318,11 +302,6 @@ def _file_names(ids: pa.ChunkedArray) -> pa.ChunkedArray:
     if not pc.all(is_safe, min_count=0).as_py():
         check_id(ids.filter(pc.invert(is_safe))[0].as_py(), "patch id")
     return ids
-
-
-def _counts(column: pa.ChunkedArray) -> dict[Any, int]:
-    """How often each value occurs."""
-    return {row["values"]: row["counts"] for row in pc.value_counts(column).to_pylist()}
 
 
 def _read_side_table(path: Path, schema: pa.Schema, columns: list[str] | None = None) -> pa.Table:

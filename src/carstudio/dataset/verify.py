@@ -5,8 +5,10 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
 
 from carstudio.dataset.patch import MaskValue, PatchRecord
+from carstudio.dataset.reading import open_parquet, reading
 from carstudio.dataset.soundness import value_problems
 from carstudio.dataset.writer import count_patches, shard_paths
 from carstudio.errors import InputError
@@ -22,7 +24,7 @@ def verify_store(store: "PatchStore") -> list[str]:
     problems = list(_shard_problems(store))
     if problems:
         return problems
-    for part in (_patch_problems, _verdict_problems, _split_problems):
+    for part in (_patch_problems, _verdict_problems, _split_problems, _duplicate_problems):
         try:
             problems.extend(part(store))
         except InputError as error:  # what cannot be read ends its part, not the others
@@ -47,6 +49,19 @@ def _split_problems(store: "PatchStore") -> Iterator[str]:
     for name in store.split_names():
         unknown = store.split(name).keys() - known
         yield from (f"splits/{name}.parquet: patch {patch_id} is not in the store" for patch_id in sorted(unknown))
+
+
+def _duplicate_problems(store: "PatchStore") -> Iterator[str]:
+    path = store.path / "duplicates.parquet"
+    if not path.is_file():
+        return
+    file = open_parquet(path, pa.schema([pa.field("patch_id", pa.string())]))
+    with reading(path):
+        ids = file.read(columns=["patch_id"])["patch_id"].to_pylist()
+    known = set(store.patch_ids(kept=False))
+    yield from (
+        f"duplicates.parquet: patch {patch_id} is not in the store" for patch_id in ids if patch_id not in known
+    )
 
 
 def _shard_problems(store: "PatchStore") -> Iterator[str]:

@@ -4,7 +4,7 @@ A shard is written to a temporary file and renamed when it is complete. The mani
 from the first moment to `close`; a store cut off in between opens with the shards that are there.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -50,8 +50,9 @@ def shard_paths(folder: Path) -> list[Path]:
 
 
 def side_tables(folder: Path) -> list[Path]:
-    """The verdicts and splits of a store that are there."""
-    return [path for path in (folder / "verdicts.parquet", *(folder / "splits").glob("*.parquet")) if path.exists()]
+    """The verdicts, duplicates and splits of a store that are there."""
+    tables = (folder / "verdicts.parquet", folder / "duplicates.parquet", *(folder / "splits").glob("*.parquet"))
+    return [path for path in tables if path.exists()]
 
 
 @contextmanager
@@ -84,7 +85,7 @@ class StoreWriter:
         self,
         path: Path | str,
         *,
-        source: str,
+        source: str | Sequence[str],
         mode: str = "create",
         resume_key: str | None = None,
         groups_per_shard: int = GROUPS_PER_SHARD,
@@ -100,12 +101,12 @@ class StoreWriter:
             self.lock.release()
             raise
 
-    def _begin(self, source: str, mode: str, resume_key: str | None) -> None:
+    def _begin(self, source: str | Sequence[str], mode: str, resume_key: str | None) -> None:
         previous = self._previous_manifest(mode)
         remove_partials(self.path)
         if mode == "create" and (resume_key is None or resume_key != previous.resume_key):
             self._start_over(previous)
-        sources = tuple(sorted({*previous.sources, source}))
+        sources = tuple(sorted({*previous.sources, *([source] if isinstance(source, str) else source)}))
         self._manifest = Manifest(sources, previous.shards, resume_key=resume_key)
         write_manifest(self.path, self._manifest)
         shards = shard_paths(self.path)

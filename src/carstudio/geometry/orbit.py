@@ -34,3 +34,13 @@ def orbit_camera(size_px: int, field_of_view_deg: float = 30.0) -> Camera:
 def orbit_distance(size: Float[Tensor, "3"], field_of_view_deg: float = 30.0, fill: float = 0.95) -> float:
     """Distance at which the car's bounding sphere fills the given share of the image's width."""
     return float(size.norm()) / 2 / (fill * math.sin(math.radians(field_of_view_deg) / 2))
+
+
+def viewing_angles(box: Box3D) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """(azimuth in (-pi, pi], elevation in [-pi/2, pi/2]), rad, from which a camera sees a box: `orbit_box` reversed.
+
+    The camera's place in the car frame counts, not the heading in the picture: 0 is before the car's front, pi/2 at its
+    left side; elevation is positive where the camera is higher than the box's centre.
+    """
+    x, y, z = (-(box.center[..., None, :] @ box.rotation)[..., 0, :]).unbind(-1)
+    return torch.atan2(z, x), torch.atan2(-y, torch.hypot(x, z))

@@ -20,6 +20,7 @@ INK = "#7d8590"
 GRID = "#7d859033"
 BLUE = "#3b82f6"
 TEAL = "#14a38b"
+AMBER = "#e8833a"
 PIXELS_PER_INCH = 160
 SMOOTHING = 0.9  # weight of the past in the running mean drawn over a noisy curve
 
@@ -35,7 +36,7 @@ def learning_curve(rows: Sequence[Mapping[str, Any]], *, style: PlotFormat = "pn
     _curve(right, *_series(rows, "psnr"), title="PSNR (dB)", colour=TEAL)
     if any(value > 0 for value in _series(rows, "loss")[1]):
         left.set_yscale("log")
-    return _bytes(figure, style)
+    return figure_bytes(figure, style)
 
 
 def bars(
@@ -56,10 +57,10 @@ def bars(
             axes.plot([low, high], [row, row], color=INK, linewidth=1.4)
         axes.annotate(f"{values[name]:.4g}", (max(high, values[name]), row), (5, 0), textcoords="offset points",
                       va="center", color=INK, fontsize=9)  # fmt: skip
-    _dress(axes, title)
+    dress(axes, title)
     axes.grid(visible=False, axis="y")
     axes.margins(x=0.1)
-    return _bytes(figure, style)
+    return figure_bytes(figure, style)
 
 
 def _series(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[list[float], list[float]]:
@@ -86,11 +87,12 @@ def _curve(axes: Axes, steps: Sequence[float], values: Sequence[float], *, title
         axes.plot(steps, values, color=colour, linewidth=1.8, marker="o", markersize=3)
     if not values:
         axes.text(0.5, 0.5, "not logged", transform=axes.transAxes, ha="center", va="center", color=INK)
-    _dress(axes, title)
+    dress(axes, title)
     axes.set_xlabel("training step", color=INK, fontsize=9)
 
 
-def _dress(axes: Axes, title: str) -> None:
+def dress(axes: Axes, title: str) -> None:
+    """Give a plot its title and the look of all our plots."""
     axes.set_title(title, loc="left", fontsize=10, fontweight="bold", color=INK)
     axes.tick_params(colors=INK, labelsize=9, which="both")
     axes.grid(visible=True, color=GRID, linewidth=0.8)
@@ -101,7 +103,7 @@ def _dress(axes: Axes, title: str) -> None:
         spine.set_color(INK)
 
 
-def _bytes(figure: Figure, style: PlotFormat) -> bytes:
+def figure_bytes(figure: Figure, style: PlotFormat) -> bytes:
     """The same figure gives the same bytes: no date, no random ids."""
     buffer = io.BytesIO()
     metadata: dict[str, Any] = {"Date": None} if style == "svg" else {"Software": None}

@@ -9,27 +9,17 @@ from collections import Counter
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TextIO
+from typing import TextIO
 
+from carstudio.dataset.export_folder import UNFINISHED, ExportSummary, Which, export_folder, write_once
 from carstudio.dataset.legacy_json.fields import parse_record
 from carstudio.dataset.legacy_json.made import Namer, dataset_name, made_mask, made_picture, made_record, obstacle
 from carstudio.dataset.legacy_json.verbatim import Verbatim, unpack_extra
 from carstudio.dataset.patch import PatchRecord
 from carstudio.dataset.store import PatchStore
-from carstudio.errors import InputError, StorageError
-from carstudio.files import atomic_path, inside, remove_partials, write_text
+from carstudio.errors import InputError
+from carstudio.files import atomic_path, inside
 from carstudio.progress import Report, silent
-
-UNFINISHED = ".unfinished-export"  # lies in the folder until the export is whole
-
-
-@dataclass(frozen=True)
-class ExportSummary:
-    """What an export wrote, and how many patches it left out for which reason."""
-
-    out: Path
-    files: dict[str, int]  # json -> records
-    left_out: dict[str, int]
 
 
 @dataclass(frozen=True)
@@ -84,24 +74,10 @@ class _JsonFile:
         self._text.write(self._closing)
 
 
-def export_legacy(
-    store: PatchStore, out: Path, *, patches: Literal["kept", "all"] = "kept", report: Report = silent
-) -> ExportSummary:
+def export_legacy(store: PatchStore, out: Path, *, patches: Which = "kept", report: Report = silent) -> ExportSummary:
     """Write the store's patches in the authors' layout below `out`, a new or empty folder."""
-    _begin(out)
-    summary = _export(store, out, frozenset(store.patch_ids(kept=patches == "kept")), report)
-    (out / UNFINISHED).unlink()
-    return summary
-
-
-def _begin(out: Path) -> None:
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{out}: expected a folder to export to, found a file; choose another --out")
-    if out.is_dir() and any(out.iterdir()) and not (out / UNFINISHED).exists():
-        raise InputError(f"{out}: holds other files; choose a new or an empty folder for --out")
-    if out.is_dir():
-        remove_partials(out)
-    write_text(out / UNFINISHED, "carstudio dataset export was interrupted here; the same command finishes it\n")
+    with export_folder(out):
+        return _export(store, out, frozenset(store.patch_ids(kept=patches == "kept")), report)
 
 
 def _export(store: PatchStore, out: Path, wanted: frozenset[str], report: Report) -> ExportSummary:
@@ -183,15 +159,4 @@ def _write_picture(out: Path, name: str, data: bytes) -> None:
     path = inside(out, name)
     if path.suffix == ".json" or path.name == UNFINISHED:
         raise InputError(f"picture {name!r}: expected a name of a picture, such as patch/km_0100097004_patch.png")
-    try:
-        if path.exists() and path.read_bytes() != data:
-            raise InputError(
-                f"{path}: two patches want this file with other content, or it is broken; remove the folder"
-            )
-        if not path.exists():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            partial = path.with_name(f".{path.name}.partial")  # no fsync: a million of them would take an hour
-            partial.write_bytes(data)
-            partial.replace(path)
-    except OSError as error:
-        raise StorageError(path, error.strerror) from error
+    write_once(out, name, data)
