@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import torch
 
-from carstudio.dataset.build import judge_store
 from carstudio.dataset.filters import FilterRecipe
+from carstudio.dataset.judging import judge_store
 from carstudio.dataset.patch import MaskValue, PatchRecord
 from carstudio.dataset.splits import write_splits
 from carstudio.dataset.store import PatchStore, StoreWriter, open_store

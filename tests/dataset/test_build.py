@@ -10,9 +10,10 @@ import pyarrow.dataset
 import pytest
 import torch
 
-from carstudio.dataset.build import BuildConfig, build, judge_store
+from carstudio.dataset.build import BuildConfig, build
 from carstudio.dataset.filters import FilterRecipe
 from carstudio.dataset.inputs import digest_of_inputs
+from carstudio.dataset.judging import judge_store
 from carstudio.dataset.outlines import CORE_PARTS, core_hulls, crop_window, object_box, object_hull, occluder_hulls
 from carstudio.dataset.patch import MaskValue
 from carstudio.dataset.plans import input_places, open_source, plan_frames
@@ -172,7 +173,7 @@ BAD_CONFIGS = [
     ({"frames": "x"}, "expected A-B with whole numbers"),
     ({"sequence": "0042"}, "no sequence '0042'; there are ['0000']"),
     ({"source": "kitti-det"}, "no folder image_2/ or training/image_2/"),
-    ({"segmenter": "magic"}, "expected one of grabcut, ground-truth, onnx:FILE, precomputed:FOLDER"),
+    ({"segmenter": "magic"}, "expected one of grabcut, sam"),
     ({"workers": -1}, "--workers must be 0 (one per core) or more, found -1"),
 ]
 

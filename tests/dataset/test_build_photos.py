@@ -21,6 +21,7 @@ from carstudio.images import decode_image, encode_png
 from carstudio.perception.coco import read_results
 from carstudio.perception.rle import encode_rle
 from dataset.made_up_kitti import P2, car_line, made_up_kitti
+from perception.tiny_hub import photograph, save_dfine, save_sam, save_sam2
 
 KEEP_ALL = FilterRecipe(height_px=0.0, width_px=0.0, box_iou=0.0, mask_ratio=-1.0, score_mask=0.0)
 
@@ -332,3 +333,25 @@ def test_real_frames_as_plain_photographs(test_data: Path, tmp_path: Path) -> No
     assert np.median([record.box_iou for record in exact.records() if record.box_iou is not None]) > 0.8
     rough = build_photos(folder / "image_2", tmp_path / "rough", camera="1500", **options)
     assert rough.info()["kept"] < exact.info()["kept"]
+
+
+@pytest.mark.parametrize("kind", ["sam", "sam2"])
+def test_pretrained_networks_from_folders(tmp_path: Path, kind: str) -> None:
+    """Small random networks in place of the hub's: D-FINE finds boxes, SAM or SAM 2 cuts; workers change no byte."""
+    (tmp_path / "detector").mkdir()
+    (tmp_path / "sam").mkdir()
+    save_dfine(tmp_path / "detector", names=("car", "truck", "bus", "van"))
+    {"sam": save_sam, "sam2": save_sam2}[kind](tmp_path / "sam")
+    folder = tmp_path / "p"
+    folder.mkdir()
+    for number in range(9):
+        (folder / f"{number}.png").write_bytes(encode_png(photograph(90 + number, 120, seed=number)))
+    options = {"detector": f"transformers:{tmp_path}/detector", "segmenter": f"{kind}:{tmp_path}/sam"}
+    one = build_photos(folder, tmp_path / "one", types=("Car", "Truck", "Bus", "Van"), **options)
+    two = build_photos(folder, tmp_path / "two", types=("Car", "Truck", "Bus", "Van"), workers=2, **options)
+    assert len(one) > 9
+    assert one.data_sha256 == two.data_sha256
+    records = list(one.records())
+    assert all(record.score_2d is not None and record.score_mask is not None for record in records)
+    shares = [record.mask_ratio for record in records if record.mask_ratio is not None]
+    assert 0.01 < float(np.mean(shares)) < 0.99

@@ -11,8 +11,9 @@ import torch
 from PIL import Image
 
 from carstudio.dataset import writer
-from carstudio.dataset.build import BuildConfig, build, judge_store
+from carstudio.dataset.build import BuildConfig, build
 from carstudio.dataset.filters import FilterRecipe
+from carstudio.dataset.judging import judge_store
 from carstudio.dataset.legacy_json.names import identify
 from carstudio.dataset.patch import MaskValue
 from carstudio.dataset.sources.kitti_format import parse_calibration

@@ -131,7 +131,7 @@ def _build(workers: int) -> Target:
     return Target(
         "build",
         lambda inputs, out: [
-            *("build", "kitti-mot", "--root", str(inputs / "kitti"), "--out", str(out)),
+            *("build", "kitti-mot", "--root", str(inputs / "kitti"), "--out", str(out), "--no-report"),
             *("--workers", str(workers), "--quiet"),
         ],
         lambda arguments, out: arguments,

@@ -11,6 +11,7 @@ from carstudio.dataset.filters import FilterRecipe
 from carstudio.dataset.sources.frame import CameraOffset
 from carstudio.dataset.summary import BuildSummary
 from carstudio.dataset.writer import count_patches, shard_paths
+from carstudio.progress import Report
 
 _SHOWN_PROBLEMS = 20
 
@@ -50,7 +51,11 @@ class Build(Output):
     filters: tyro.conf.OmitArgPrefixes[FilterRecipe] = field(default_factory=FilterRecipe)
     """Thresholds; the released ones by default. legacy-json takes none: `dataset refilter` judges it again."""
     workers: int = 0
-    """Processes; 0: one per core. Changes nothing in the result."""
+    """Processes; 0: one per core, one where networks run on a GPU. Each has its own copy of the networks (SAM ViT-H:
+    2.6 GB)."""
+
+    report: bool = True
+    """Write OUT/report/index.html: counts per reason, distributions, viewpoints, cameras, pictures of each verdict."""
 
     def saved(self) -> str:
         """The whole shards."""
@@ -76,7 +81,14 @@ class Build(Output):
         )
         with self.progress() as report:
             summary = build(config, report)
-        return Outcome(describe(summary), plain(summary))
+            page = self._write_report(summary, report) if self.report else None
+        text = describe(summary) if page is None else f"{describe(summary)}\nreport: {page}"
+        return Outcome(text, {**plain(summary), "report": None if page is None else str(page)})
+
+    def _write_report(self, summary: BuildSummary, report: Report) -> Path:
+        from carstudio.report.build_page import write_build_report
+
+        return write_build_report(self.out, self.out / "report", problems=summary.problems, report=report)
 
 
 def describe_unfinished(out: Path) -> str:

@@ -4,13 +4,14 @@ Frames are worked on in processes and written in order, so that the number of wo
 build goes on where it stopped when it is started again with the same settings.
 """
 
-import os
 import time
 from contextlib import closing
 from dataclasses import asdict, replace
 
-from carstudio.dataset.filters import FilterRecipe, judge
+from carstudio.dataset.duplicates import find_duplicates
+from carstudio.dataset.filters import FilterRecipe
 from carstudio.dataset.inputs import digest_of_inputs
+from carstudio.dataset.judging import judge_store
 from carstudio.dataset.plans import BuildConfig, SourceKind, input_places, plan_frames, plan_legacy
 from carstudio.dataset.runs import is_made_already, write_run
 from carstudio.dataset.splits import write_splits
@@ -32,7 +33,7 @@ def build(config: BuildConfig, report: Report = silent) -> BuildSummary:
         clear_leftovers(config.out)
         return summarize(open_store(config.out), source=config.source)
     plan = plan_legacy(config, report) if config.source == "legacy-json" else plan_frames(config, settings["inputs"])
-    workers = _num_workers(config.workers, plan.num_items // (2 * plan.chunk))
+    workers = _num_workers(config.workers, plan.num_items // (2 * plan.chunk), plan.workers)
     problems = list(plan.problems)
     with StoreWriter(config.out, source=plan.source, resume_key=plan.resume_key) as writer:
         write_run(config.out, settings)
@@ -45,25 +46,29 @@ def build(config: BuildConfig, report: Report = silent) -> BuildSummary:
                 problems += result.problems
                 done += result.num_items
                 report("build", done, plan.num_items, f"{len(writer)} candidates")
-        judge_and_split(writer, plan.filters)
+        judge_and_split(writer, plan.filters, finds_duplicates=plan.finds_duplicates, workers=workers, report=report)
     summary = summarize(open_store(config.out), source=plan.source)
     return replace(summary, problems=tuple(problems), seconds=time.perf_counter() - start)
 
 
-def judge_and_split(writer: StoreWriter, recipe: FilterRecipe) -> None:
+def judge_and_split(
+    writer: StoreWriter,
+    recipe: FilterRecipe,
+    *,
+    finds_duplicates: bool = False,
+    workers: int = 1,
+    report: Report = silent,
+) -> None:
     """Verdicts and splits of all that was written: before the writer closes, so that "finished" comes last.
 
     A run killed before that is unfinished and goes on when it is started again.
     """
     writer.flush()
     store = open_store(writer.path, lock=writer.lock)
+    if finds_duplicates:
+        find_duplicates(store, workers=min(workers, 1 + len(store) // 2000), report=report)
     judge_store(store, recipe)
     write_splits(store)
-
-
-def judge_store(store: PatchStore, recipe: FilterRecipe) -> None:
-    """Judge every patch again by its stored values and replace the store's verdicts."""
-    store.write_verdicts(judge(record, recipe) for record in store.light_records())
 
 
 def summarize(store: PatchStore, *, source: str) -> BuildSummary:
@@ -80,7 +85,7 @@ def summarize(store: PatchStore, *, source: str) -> BuildSummary:
     )
 
 
-def _num_workers(workers: int, most: int) -> int:
+def _num_workers(workers: int, most: int, most_useful: int) -> int:
     if workers < 0:
         raise InputError(f"--workers must be 0 (one per core) or more, found {workers}")
-    return min(workers or os.cpu_count() or 1, max(1, most))  # a process takes seconds to start
+    return min(workers or most_useful, max(1, most))  # a process takes seconds to start

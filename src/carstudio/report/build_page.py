@@ -38,6 +38,7 @@ TITLES = {
     "score_2d": "Score of the 2-D box",
     "score_mask": "Score of the mask",
     "score_3d": "Score of the 3-D box",
+    "viewpoint_deg": "Yaw against the source's viewpoint (°)",
     "mask_ratio": "Car pixels / pixels of the crop",
     "box_iou": "IoU of 2-D and projected box",
     "yaw_deg": "Yaw, KITTI's rotation_y (°)",
@@ -49,7 +50,7 @@ TITLES = {
     "truncation": "Truncation",
     "occlusion": "Occlusion (level)",
 }
-_NO_DISTRIBUTION = ("box3d", "type", "crop_width", "crop_height")
+_NO_DISTRIBUTION = ("box3d", "type", "centred", "crop_width", "crop_height")
 MOST_PAIRS = 12  # of like pictures
 MOST_PROBLEMS = 200  # told on the page
 MOST_PICTURES = 1000  # per reason: a sheet is held in memory and in the page
