@@ -15,6 +15,7 @@ from carstudio.models.encoders import EncoderConfig, build_encoder, load_imagene
 from carstudio.models.gaussian_template import surface_template
 from carstudio.models.interface import CategoryModel, Latents, PatchBatch
 from carstudio.models.patch_features import POSE_FEATURES, pose_features, tiny_masked_copy
+from carstudio.models.photo_features import PHOTO_FEATURES, photo_at
 from carstudio.rendering.gaussians.cloud import GaussianCloud
 from carstudio.rendering.gaussians.tracing import SplattingConfig, trace_cloud
 from carstudio.rendering.rays import Rays, to_canonical
@@ -43,6 +44,10 @@ class CarGaussiansConfig:
     """Gaussians come in pairs mirrored in the car's middle plane; colours are free."""
     colour_skip_px: int = 8
     """Side of a tiny copy of the masked crop, added to the texture code by a linear map; 0: none."""
+    sees_photo: bool = True
+    """Look up each Gaussian's place (and its mirror image's) in the photo; the findings lengthen the texture code."""
+    embedding: int = 16
+    """Length of what the colour decoder knows about each Gaussian."""
     least_scale: float = 0.01
     """Smallest standard deviation of a Gaussian, canonical units."""
     largest_scale: float = 0.5
@@ -76,7 +81,12 @@ class CarGaussians(CategoryModel):
         texture = self.texture_head(features)
         if self.config.colour_skip_px:
             texture = texture + self.colour_skip(tiny_masked_copy(patches, self.config.colour_skip_px))
-        return Latents(self.shape_norm(self.shape_head(features)), self.texture_norm(texture))
+        shape, texture = self.shape_norm(self.shape_head(features)), self.texture_norm(texture)
+        if self.config.sees_photo:
+            with torch.no_grad(), torch.autocast(patches.image.device.type, enabled=False):
+                mean = self.geometry(shape.to(patches.image.dtype))[0]
+                texture = torch.cat([texture, photo_at(mean, patches).flatten(1).to(texture.dtype)], dim=-1)
+        return Latents(shape, texture)
 
     def decode(self, latents: Latents) -> GaussianCloud:
         """The car's Gaussians in the canonical frame."""
@@ -140,14 +150,40 @@ class GeometryDecoder(nn.Module):
 
 
 class ColourDecoder(nn.Module):
-    """Texture code (and the detached shape code) to a colour per Gaussian."""
+    """Texture code (and the detached shape code) to a colour per Gaussian.
+
+    Where the photo was looked up, the colour is a mix of what the code says, what the photo shows at the Gaussian and
+    what it shows at the Gaussian's mirror image.
+    """
 
     def __init__(self, config: CarGaussiansConfig) -> None:
         super().__init__()
+        self.config = config
         self.hidden = nn.Sequential(nn.Linear(2 * config.code_size, config.width), nn.SiLU())
         self.colours = nn.Linear(config.width, config.num_splats * 3)
+        if config.sees_photo:
+            self.embedding = nn.Parameter(torch.randn(config.num_splats, config.embedding))
+            self.context = nn.Linear(config.width, config.embedding)
+            self.mix = nn.Sequential(
+                nn.Linear(2 * PHOTO_FEATURES + 2 * config.embedding, 64), nn.SiLU(), nn.Linear(64, 6)
+            )
 
     def forward(self, latents: Latents) -> Float[Tensor, "batch splat 3"]:
-        """Rgb in [0, 1]."""
-        codes = torch.cat([latents.texture, latents.shape.detach()], dim=-1)
-        return torch.sigmoid(self.colours(self.hidden(codes)).unflatten(-1, (-1, 3)))
+        """rgb in [0, 1]."""
+        code = latents.texture[:, : self.config.code_size]
+        hidden = self.hidden(torch.cat([code, latents.shape.detach()], dim=-1))
+        colours = self.colours(hidden).unflatten(-1, (-1, 3))
+        if not self.config.sees_photo:
+            return torch.sigmoid(colours)
+        photo = latents.texture[:, self.config.code_size :].unflatten(-1, (-1, PHOTO_FEATURES))
+        other = photo.roll(self.config.num_splats // 2, dims=1)
+        context = self.context(hidden)[:, None].expand(-1, self.config.num_splats, -1)
+        known = torch.cat([photo, other, context, self.embedding.expand(len(code), -1, -1)], dim=-1)
+        mixed = self.mix(known)
+        own = torch.sigmoid(colours + mixed[..., :3])
+        share = mixed[..., 3:].softmax(dim=-1) * torch.stack(
+            [torch.ones_like(photo[..., 3]), photo[..., 3], other[..., 3]], dim=-1
+        )
+        share = share / share.sum(dim=-1, keepdim=True)
+        seen, mirrored = (found[..., :3] / found[..., 3:].clamp(min=1e-3) for found in (photo, other))
+        return share[..., :1] * own + share[..., 1:2] * seen + share[..., 2:] * mirrored

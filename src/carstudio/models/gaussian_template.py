@@ -25,10 +25,7 @@ class Template:
 def surface_template(count: int, *, is_half: bool) -> Template:
     """`count` discs evenly spread over the rounded box, or over its left half (z > 0)."""
     around = count * 2 if is_half else count
-    directions = _fibonacci(around)
-    if is_half:
-        directions = directions[directions[:, 2] > 0]
-        assert len(directions) == count, "a Fibonacci sphere of even count has as many points on either side"
+    directions = _fibonacci(around)[:count]  # z falls along the spiral: the first half has z > 0
     norm = (directions.abs() ** ROUNDNESS).sum(dim=-1, keepdim=True) ** (1 / ROUNDNESS)
     mean = EXTENT * directions / norm
     normal = torch.nn.functional.normalize(mean.abs() ** (ROUNDNESS - 1) * mean.sign(), dim=-1)

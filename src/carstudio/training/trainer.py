@@ -21,7 +21,7 @@ from carstudio.models.zoo import ModelConfig, build_model
 from carstudio.progress import Report, silent
 from carstudio.rendering.rays import to_canonical
 from carstudio.rendering.volume import composite
-from carstudio.training.batches import StepSampler, Supervision, generator_for
+from carstudio.training.batches import Mirroring, StepSampler, Supervision, generator_for
 from carstudio.training.checkpoint import describe_model, load_weights_of, pick_device, save_model
 from carstudio.training.log import LOG, TrainingLog
 from carstudio.training.losses import LossConfig, masked_psnr, training_loss
@@ -44,6 +44,8 @@ class TrainConfig:
     """Learning rate."""
     supervision: Supervision = "single-view"
     """Which photo of the car an encoded photo must explain."""
+    mirroring: Mirroring = "off"
+    """Whether photos are flipped left to right half of the time: never, input and explained photo alike, or each."""
     patches_per_step: int = 3
     """Cars encoded per step."""
     rays_per_patch: int = 1024
@@ -175,6 +177,7 @@ class _Run:
             patches_per_step=config.patches_per_step,
             supervision=config.supervision,
             seed=config.seed,
+            mirroring=config.mirroring,
         )
 
     def begin(self, *, init: Path | None) -> None:

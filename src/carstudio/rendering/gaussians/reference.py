@@ -18,7 +18,7 @@ def responses(
 ) -> tuple[Float[Tensor, "batch ray splat"], Float[Tensor, "batch ray splat"]]:
     """Alpha of every Gaussian on every ray x + t d, and the t of its peak."""
     offset = points[:, :, None] - splats.mean[:, None]
-    precision = splats.precision[:, None]
+    precision = splats.precision[:, None].expand(*offset.shape, 3)
     direction = directions[:, :, None].expand_as(offset)
     across = (precision @ direction[..., None]).squeeze(-1)
     b, e = (across * offset).sum(dim=-1), (across * direction).sum(dim=-1)

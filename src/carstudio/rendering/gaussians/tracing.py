@@ -51,7 +51,7 @@ def splats_seen(cloud: GaussianCloud, canonical: CanonicalRays) -> Splats:
     """
     eye = canonical.origins.mean(dim=1)
     metric = (cloud.mean - eye[:, None]) @ torch.linalg.inv(canonical.linear).mT
-    radius = canonical.radii.mean(dim=1)[:, None] * metric.norm(dim=-1).detach()
+    radius = canonical.radii.mean(dim=1)[:, None] * metric.norm(dim=-1)
     footprint = footprint_variance(radius, canonical.linear)
     return widened_splats(cloud, eye, footprint)
 
