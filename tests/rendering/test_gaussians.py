@@ -15,7 +15,7 @@ from carstudio.models.gaussian_template import surface_template
 from carstudio.rendering.gaussians import hits
 from carstudio.rendering.gaussians.cloud import GaussianCloud, Splats, invert_symmetric, splats_of, widened_splats
 from carstudio.rendering.gaussians.reference import MAX_ALPHA, responses, sorted_responses
-from carstudio.rendering.gaussians.tracing import SplattingConfig, trace_cloud
+from carstudio.rendering.gaussians.tracing import SplattingConfig, render_cloud, trace_cloud
 from carstudio.rendering.rays import Rays, image_rays, to_canonical
 from carstudio.rendering.volume import Rendering, composite, merge_segments
 from rendering.scenes import batched, kitti_camera, positions_on_box, tilted_box
@@ -144,6 +144,31 @@ def test_the_fast_path_equals_the_plain_one(make, chunk: int, monkeypatch: pytes
     assert float((plain.depth_m - fast.depth_m)[solid].abs().max()) < 0.03
     for plain_gradient, fast_gradient in zip(plain_gradients, fast_gradients, strict=True):
         assert float((plain_gradient - fast_gradient).norm() / plain_gradient.norm()) < 0.05
+
+
+@pytest.mark.parametrize("make", [random_cloud, surface_cloud])
+def test_the_short_way_equals_compositing_the_segments(make) -> None:
+    """Values and gradients, colour, opacity and depth, in float64."""
+    rays = image_rays(camera(12))
+    canonical = to_canonical(rays, car_box())
+    weights = torch.randn(1, 144, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    results = []
+    for is_short in (False, True):
+        parts = leaves(make())
+        cloud = GaussianCloud(*parts)
+        segments = (rays, canonical, FAST)
+        found = render_cloud(cloud, *segments) if is_short else composite(trace_cloud(cloud, *segments))
+        solid = found.opacity.detach() > 1e-3
+        loss = (found.rgb * weights).sum() + found.opacity.square().sum() + (found.depth_m * solid).sum()
+        results.append((found, torch.autograd.grad(loss, parts)))
+    (plain, plain_gradients), (short, short_gradients) = results
+    solid = plain.opacity > 1e-3
+    assert torch.allclose(plain.rgb, short.rgb, atol=1e-12)
+    assert torch.allclose(plain.opacity, short.opacity, atol=1e-12)
+    assert torch.allclose(plain.depth_m[solid], short.depth_m[solid], atol=1e-9)
+    assert torch.allclose(plain.distance_m[solid], short.distance_m[solid], atol=1e-9)
+    for a, b in zip(plain_gradients, short_gradients, strict=True):
+        assert float((a - b).norm()) < 1e-9 * float(a.norm())
 
 
 def test_only_what_lies_behind_is_left_out() -> None:

@@ -20,7 +20,6 @@ from carstudio.models.interface import CategoryModel
 from carstudio.models.zoo import ModelConfig, build_model
 from carstudio.progress import Report, silent
 from carstudio.rendering.rays import to_canonical
-from carstudio.rendering.volume import composite
 from carstudio.training.batches import Mirroring, StepSampler, Supervision, generator_for
 from carstudio.training.checkpoint import describe_model, load_weights_of, pick_device, save_model
 from carstudio.training.log import LOG, TrainingLog
@@ -229,8 +228,7 @@ class _Run:
         self.model.train()
         with autocast(config.precision, self.device):
             latents = self.model.encode(patches)
-            levels = self.model.trace_levels(pixels.rays, latents, pixels.box, jitter)
-        renderings = tuple(composite(segments) for segments in levels)
+            renderings = self.model.render_levels(pixels.rays, latents, pixels.box, jitter)
         counts = pixels.is_known & to_canonical(pixels.rays, pixels.box).hit
         terms = training_loss(renderings, pixels.rgb, pixels.alpha, counts, config.loss)
         loss = torch.stack(list(terms.values())).sum()

@@ -18,7 +18,6 @@ from carstudio.rendering.gaussians.reference import MAX_ALPHA
 FAINTEST = 1.0 / 512  # an alpha below it is nothing: half a step of an 8-bit image
 _CHUNK = {"cpu": 2**17, "other": 2**26}  # ray-splat pairs at a time: on a CPU some arrays of them fit the L2 cache
 _REACH = 4.0  # canonical units: farther from x than this along the ray no Gaussian of a box [-1, 1]^3 can peak
-_MISS = 2**30  # bit of a key that is set where the ray misses the Gaussian: sorts behind all hits
 
 
 def ray_hits(
@@ -76,18 +75,19 @@ class _Hits(torch.autograd.Function):
         peak = features.new_empty(batch, num_rays, most)
         limit = 2 * torch.log((opacity / FAINTEST).clamp(min=1e-12))
         for entries, rays in _chunks(features, num_splats):
-            part = features[entries, rays]
-            keys, distance2, at = _keys(part, coefficients[entries], limit[entries], nearest[entries, rays])
+            keys, over, at = _keys(
+                features[entries, rays], coefficients[entries], limit[entries], nearest[entries, rays]
+            )
             keys = _first(keys, most)
-            bits = (num_splats - 1).bit_length()
-            rows = (keys & (2**bits - 1)).long()
-            hit = keys < _MISS
-            found = torch.gather(distance2, -1, rows).clamp_(min=0)
-            response = torch.exp(found.mul_(-0.5)).mul_(hit)
+            rows = (keys & (2 ** _bits(num_splats) - 1)).long()
+            hit = keys < _missed(num_splats)
+            places = rows.flatten(1)
+            found = torch.gather(over, -1, rows) + torch.gather(limit[entries], -1, places).view_as(rows)
+            response = torch.exp(found.clamp_(min=0).mul_(-0.5)).mul_(hit)
             peak[entries, rays] = response
-            picked = torch.gather(opacity[entries, None].expand(-1, rows.shape[1], -1), -1, rows)
+            picked = torch.gather(opacity[entries], -1, places).view_as(rows)
             alpha[entries, rays] = (response * picked).clamp_(max=MAX_ALPHA)
-            t[entries, rays] = torch.gather(at, -1, rows).masked_fill_(~hit, _REACH)
+            t[entries, rays] = torch.gather(at, -1, rows).div_(_scale(num_splats)).masked_fill_(~hit, _REACH)
             index[entries, rays] = rows
         ctx.save_for_backward(coefficients, features, alpha, t, index, peak)
         ctx.mark_non_differentiable(index)
@@ -134,19 +134,39 @@ def _chunks(features: Tensor, num_splats: int) -> list[tuple[slice, slice]]:
 
 
 def _keys(features: Tensor, coefficients: Tensor, limit: Tensor, nearest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Sortable keys (depth above, number below, `_MISS` where there is no hit), squared distances and t of peaks."""
+    """Sortable keys (t above, number below; `_missed`: no hit), distance2 - limit and scaled t of peaks.
+
+    No comparisons: they cost more than arithmetic. What is farther than its limit is pushed out of the range of t.
+    """
     num_splats = coefficients.shape[-1]
-    c = features[..., :10] @ coefficients
-    b = features[..., 10:19] @ coefficients[:, :9]
-    e = features[..., 19:] @ coefficients[:, :6]
-    t = b.neg().div_(e)
-    distance2 = torch.addcmul(c, b, t)
-    bits = (num_splats - 1).bit_length()
-    scale = 2 ** (29 - bits) / _REACH  # t in (-reach, reach) takes the 30 - bits bits above the number
-    keys = ((t + _REACH) * scale).clamp_(0, 2 ** (30 - bits) - 1).to(torch.int32)
-    keys = keys.mul_(2**bits).add_(torch.arange(num_splats, dtype=torch.int32, device=t.device))
-    miss = (distance2 > limit[:, None]) | (t <= nearest[..., None])
-    return keys.add_(miss.to(torch.int32), alpha=_MISS), distance2, t
+    scale = _scale(num_splats)
+    coefficients = coefficients.clone()
+    coefficients[:, 9] -= limit
+    over = features[..., :10] @ coefficients
+    b = (features[..., 10:19] * -scale) @ coefficients[:, :9]
+    t = b.div(features[..., 19:] @ coefficients[:, :6])
+    over.addcmul_(b, t, value=-1 / scale**2)
+    last = 2 ** (29 - _bits(num_splats))
+    place = torch.add(t, over.clamp(min=0), alpha=1e9)
+    if bool((nearest > -_REACH).any()):  # the camera is so near that Gaussians may lie behind it
+        place = torch.where(t <= nearest[..., None] * scale, float(last), place)
+    keys = place.clamp_(-last, last - 1).to(torch.int32).mul_(2 ** _bits(num_splats))
+    return keys.add_(torch.arange(num_splats, dtype=torch.int32, device=t.device)), over, t
+
+
+def _bits(num_splats: int) -> int:
+    """Bits that a Gaussian's number takes in a key."""
+    return max(1, (num_splats - 1).bit_length())
+
+
+def _scale(num_splats: int) -> float:
+    """Steps of t per canonical unit: -reach to reach takes the bits that the number leaves of 30."""
+    return 2 ** (29 - _bits(num_splats)) / _REACH
+
+
+def _missed(num_splats: int) -> int:
+    """The first key that is no hit: the last step of t."""
+    return (2 ** (29 - _bits(num_splats)) - 1) << _bits(num_splats)
 
 
 def _first(keys: Tensor, most: int) -> Tensor:

@@ -7,10 +7,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from carstudio.rendering.gaussians.cloud import GaussianCloud, Splats, splats_of, widened_splats
+from carstudio.rendering.gaussians.compositing import composite_hits
 from carstudio.rendering.gaussians.hits import ray_hits
 from carstudio.rendering.gaussians.reference import sorted_responses
 from carstudio.rendering.rays import CanonicalRays, Rays
-from carstudio.rendering.volume import Segments
+from carstudio.rendering.volume import Rendering, Segments
 
 
 @dataclass(frozen=True)
@@ -30,18 +31,35 @@ def trace_cloud(cloud: GaussianCloud, rays: Rays, canonical: CanonicalRays, conf
 
     All metric: the peak's distance along the ray, its depth, its alpha; rgb is the Gaussian's.
     """
+    alpha, t, index, middle = _hits(cloud, canonical, config)
+    distance = (t + middle[..., None]) / canonical.stretch[..., None]
+    flat = (index + cloud.rgb.shape[1] * torch.arange(len(index), device=index.device)[:, None, None]).flatten()
+    rgb = cloud.rgb.flatten(0, 1).index_select(0, flat).unflatten(0, index.shape)
+    return Segments(distance, distance * rays.directions[..., 2:], alpha, rgb)
+
+
+def render_cloud(cloud: GaussianCloud, rays: Rays, canonical: CanonicalRays, config: SplattingConfig) -> Rendering:
+    """What `composite` makes of `trace_cloud`'s segments, without laying out the segments' colours."""
+    alpha, t, index, middle = _hits(cloud, canonical, config)
+    rgb, sums, weights = composite_hits(alpha, t, index, cloud.rgb)
+    opacity = sums[..., 0]
+    distance = (sums[..., 1] / opacity.clamp(min=1e-8) + middle * (opacity > 0)) / canonical.stretch
+    return Rendering(rgb, opacity, distance, distance * rays.directions[..., 2], weights)
+
+
+def _hits(
+    cloud: GaussianCloud, canonical: CanonicalRays, config: SplattingConfig
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """alpha, t and number of each hit; t counts from the ray's point nearest the box's centre, `middle` away."""
     splats = splats_seen(cloud, canonical) if config.widen else splats_of(cloud)
     directions = canonical.view_directions
-    middle = -(canonical.origins * directions).sum(dim=-1)  # canonical distance to the point nearest the box's centre
+    middle = -(canonical.origins * directions).sum(dim=-1)
     points = canonical.origins + middle[..., None] * directions
     if config.is_reference:
         alpha, t, index = sorted_responses(splats, points, directions, -middle)
     else:
         alpha, t, index = ray_hits(splats, points, directions, -middle, most=config.most)
-    distance = (t + middle[..., None]) / canonical.stretch[..., None]
-    flat = (index + cloud.rgb.shape[1] * torch.arange(len(index), device=index.device)[:, None, None]).flatten()
-    rgb = cloud.rgb.flatten(0, 1).index_select(0, flat).unflatten(0, index.shape)
-    return Segments(distance, distance * rays.directions[..., 2:], alpha * canonical.hit[..., None], rgb)
+    return alpha * canonical.hit[..., None], t, index, middle
 
 
 def splats_seen(cloud: GaussianCloud, canonical: CanonicalRays) -> Splats:
