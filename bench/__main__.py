@@ -24,7 +24,6 @@ from carstudio.models.interface import render_image
 from carstudio.models.zoo import build_model
 from carstudio.recipes import recipe
 from carstudio.rendering.rays import to_canonical
-from carstudio.rendering.volume import composite
 from carstudio.training.batches import generator_for
 from carstudio.training.losses import training_loss
 from carstudio.training.precision import Precision, autocast, resolve_precision
@@ -50,9 +49,10 @@ class Subject:
         self.model.train()
         with autocast(self.precision, self.device):
             latents = self.model.encode(self.patches)
-            levels = self.model.trace_levels(self.pixels.rays, latents, self.pixels.box, generator_for(0, 0, "jitter"))
+            rendered = self.model.render_levels(
+                self.pixels.rays, latents, self.pixels.box, generator_for(0, 0, "jitter")
+            )
         counts = self.pixels.is_known & to_canonical(self.pixels.rays, self.pixels.box).hit
-        rendered = tuple(composite(level) for level in levels)
         terms = training_loss(rendered, self.pixels.rgb, self.pixels.alpha, counts, self.config.loss)
         self.optimizer.zero_grad(set_to_none=True)
         torch.stack(list(terms.values())).sum().backward()

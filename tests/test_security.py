@@ -13,7 +13,8 @@ from carstudio.evaluation.tables import Cell, Table, to_html
 from carstudio.images import read_image
 from carstudio.perception.specs import make_segmenter
 from carstudio.report.page import Commands, Page, Section, Text, render_page
-from carstudio.training.checkpoint import load_model, load_tensors
+from carstudio.tensors import load_tensors
+from carstudio.training.checkpoint import load_model
 from carstudio.training.resume import load_state
 
 ROOT = Path(__file__).parents[1]

@@ -35,6 +35,8 @@ VERBS = {
     "train": ("carstudio.commands.train:Train", "recipe + CarPatch3D -> trained model"),
     "evaluate": ("carstudio.commands.evaluate:Evaluate", "trained model + protocol -> result rows and their table"),
     "report": ("carstudio.commands.report:WriteReport", "trained model + store -> both protocols, pictures, one page"),
+    "fit": ("carstudio.commands.fit:Fit", "trained model + photos of one car -> that car, in a file"),
+    "export": ("carstudio.commands.export:Export", "car -> GLB or splat PLY"),
     "render": ("carstudio.commands.render:Render", "trained model + photos -> turntables, opacity, depth"),
     "models": ("carstudio.commands.models:Models", "pretrained networks: which there are, which are here, download"),
     "doctor": ("carstudio.commands.doctor:Doctor", "what is installed, what is missing, what it is for, how to get it"),

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from carstudio.errors import InputError
+from carstudio.models.car_gaussians import CarGaussiansConfig
 from carstudio.models.car_nerf import CarNeRFConfig
 from carstudio.models.encoders import EncoderConfig
 from carstudio.rendering.field import SamplingConfig
@@ -56,11 +57,28 @@ def car_nerf_small() -> TrainConfig:
     )
 
 
+def car_gaussians() -> TrainConfig:
+    """Gaussians in the car's box, for quality and speed."""
+    return TrainConfig(
+        recipe="car-gaussians",
+        model=CarGaussiansConfig(),
+        loss=LossConfig(colour="whole-crop"),
+        schedule=ScheduleConfig(first=3e-3, last=1e-4, decay_steps=None, warmup_steps=100),
+        supervision="mixed",
+        patches_per_step=16,
+        rays_per_patch=512,
+        precision="auto",
+        steps=4_000,
+        clip_gradient=1.0,
+    )
+
+
 RECIPES: dict[str, Callable[[], TrainConfig]] = {
     "car-nerf": car_nerf,
     "car-nerf-no-mask": car_nerf_no_mask,
     "car-nerf-as-released": car_nerf_as_released,
     "car-nerf-small": car_nerf_small,
+    "car-gaussians": car_gaussians,
 }
 
 

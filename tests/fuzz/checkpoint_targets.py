@@ -17,7 +17,8 @@ from carstudio.evaluation.results import ResultHeader, ResultRow, read_header, r
 from carstudio.geometry.orbit import orbit_box, orbit_camera
 from carstudio.models.interface import PatchBatch, render_image
 from carstudio.models.zoo import build_model
-from carstudio.training.checkpoint import DESCRIPTION, WEIGHTS, load_model, load_tensors, save_model, save_tensors
+from carstudio.tensors import load_tensors, save_tensors
+from carstudio.training.checkpoint import DESCRIPTION, WEIGHTS, load_model, save_model
 from carstudio.training.log import LOG, read_log
 from carstudio.training.resume import STATE, TrainingState, checksum, load_state, save_state
 from fuzz.edits import Files

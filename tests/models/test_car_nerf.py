@@ -4,9 +4,10 @@ import torch
 from carstudio.geometry.box3d import Box3D
 from carstudio.geometry.camera import Camera
 from carstudio.geometry.orbit import orbit_box, orbit_camera
-from carstudio.models.car_nerf import CarNeRF, CarNeRFConfig, pose_features, tiny_masked_copy
+from carstudio.models.car_nerf import CarNeRF, CarNeRFConfig
 from carstudio.models.encoders import EncoderConfig
 from carstudio.models.interface import Latents, PatchBatch, render_image
+from carstudio.models.patch_features import pose_features, tiny_masked_copy
 from carstudio.recipes import car_nerf, car_nerf_small
 from carstudio.rendering.field import SamplingConfig
 from carstudio.rendering.rays import image_rays

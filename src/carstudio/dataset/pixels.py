@@ -1,7 +1,7 @@
 """Patches made ready for training and scoring: decoded once, resized for the encoder, kept in a bounded cache."""
 
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -12,7 +12,7 @@ from torch import Tensor
 from carstudio.dataset.patch import MaskValue, Patch
 from carstudio.dataset.store import PatchStore
 from carstudio.errors import InputError
-from carstudio.geometry.box3d import Box3D
+from carstudio.geometry.box3d import Box3D, mirror_box
 from carstudio.geometry.camera import Camera
 
 
@@ -55,6 +55,20 @@ def prepare_patch(patch: Patch, side_px: int) -> PreparedPatch:
         encoder_image=torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))),
         encoder_mask=torch.from_numpy(cv2.resize(is_car, size, interpolation=how)),
         encoder_camera=patch.camera.resize(*size),
+    )
+
+
+def mirror_patch(patch: PreparedPatch) -> PreparedPatch:
+    """The photo flipped left to right with mirrored camera and box: another view of the same (symmetric) car."""
+    return replace(
+        patch,
+        rgb=patch.rgb.flip(1),
+        mask=patch.mask.flip(1),
+        camera=patch.camera.flip(),
+        box=mirror_box(patch.box),
+        encoder_image=patch.encoder_image.flip(2),
+        encoder_mask=patch.encoder_mask.flip(1),
+        encoder_camera=patch.encoder_camera.flip(),
     )
 
 

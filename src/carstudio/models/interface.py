@@ -70,13 +70,19 @@ class CategoryModel(nn.Module):
         """
         raise NotImplementedError
 
+    def render_levels(
+        self, rays: Rays, latents: Latents, box: Box3D, generator: torch.Generator | None = None
+    ) -> tuple[Rendering, ...]:
+        """Composited segments of each level, what training compares; a model may have a shorter way to them."""
+        return tuple(composite(segments) for segments in self.trace_levels(rays, latents, box, generator))
+
     def trace(self, rays: Rays, latents: Latents, box: Box3D) -> Segments:
         """Segments in metres, ordered along each ray; several cars and a background merge through them."""
         return self.trace_levels(rays, latents, box)[-1]
 
     def render(self, rays: Rays, latents: Latents, box: Box3D) -> Rendering:
         """Composited segments: colour over black, opacity, distance and depth in metres."""
-        return composite(self.trace(rays, latents, box))
+        return self.render_levels(rays, latents, box)[-1]
 
 
 @torch.no_grad()

@@ -6,12 +6,16 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from carstudio.errors import InputError
+from carstudio.models.car_gaussians import CarGaussians, CarGaussiansConfig
 from carstudio.models.car_nerf import CarNeRF, CarNeRFConfig
 from carstudio.models.interface import CategoryModel
 
-ModelConfig = CarNeRFConfig
+ModelConfig = CarNeRFConfig | CarGaussiansConfig
 
-MODELS: dict[str, tuple[type[Any], type[CategoryModel]]] = {"car-nerf": (CarNeRFConfig, CarNeRF)}
+MODELS: dict[str, tuple[type[Any], type[CategoryModel]]] = {
+    "car-nerf": (CarNeRFConfig, CarNeRF),
+    "car-gaussians": (CarGaussiansConfig, CarGaussians),
+}
 
 
 def build_model(config: ModelConfig) -> CategoryModel:

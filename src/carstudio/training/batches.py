@@ -11,14 +11,15 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from carstudio.dataset.patch import MaskValue
-from carstudio.dataset.pixels import PatchCache, PreparedPatch
+from carstudio.dataset.pixels import PatchCache, PreparedPatch, mirror_patch
 from carstudio.geometry.box3d import Box3D
 from carstudio.geometry.camera import Camera
 from carstudio.models.interface import PatchBatch
 from carstudio.rendering.rays import Rays, pixel_rays
 
 Supervision = Literal["single-view", "multi-view", "mixed"]
-_STREAMS = {"epoch": 1, "target": 2, "pixels": 3, "jitter": 4}
+Mirroring = Literal["off", "together", "apart"]
+_STREAMS = {"epoch": 1, "target": 2, "pixels": 3, "jitter": 4, "mirror": 5}
 
 
 def generator_for(seed: int, step: int, stream: str) -> torch.Generator:
@@ -93,12 +94,23 @@ class StepSampler:
 
     Every patch is encoded once per epoch. `single-view` explains the encoded patch itself (the paper); `multi-view`
     another patch of the same car where it has one; `mixed` either with equal chance.
+
+    Mirroring shows photos flipped left to right half of the time (a car is symmetric): encoded and explained patch
+    `together`, or each by its own draw, so that a flipped photo `apart` from the encoded one is a second view of it.
     """
 
     def __init__(
-        self, cache: PatchCache, patch_ids: list[str], *, patches_per_step: int, supervision: Supervision, seed: int
+        self,
+        cache: PatchCache,
+        patch_ids: list[str],
+        *,
+        patches_per_step: int,
+        supervision: Supervision,
+        seed: int,
+        mirroring: Mirroring = "off",
     ) -> None:
         assert patch_ids, "no patches to train on"
+        self.mirroring = mirroring
         self.cache, self.patch_ids, self.seed = cache, patch_ids, seed
         self.patches_per_step, self.supervision = patches_per_step, supervision
         table = cache.store.table(["patch_id", "instance_id"])
@@ -135,11 +147,23 @@ class StepSampler:
             return patch_id
         return others[int(draws[1] * len(others))]
 
+    def mirrored(self, step: int) -> list[tuple[bool, bool]]:
+        """Whether encoded and explained patch of each pair are flipped."""
+        if self.mirroring == "off":
+            return [(False, False)] * self.patches_per_step
+        draws = torch.rand(self.patches_per_step, 2, generator=generator_for(self.seed, step, "mirror")) < 0.5
+        second = 0 if self.mirroring == "together" else 1
+        return [(bool(row[0]), bool(row[second])) for row in draws]
+
     def batch(self, step: int, rays_per_patch: int) -> tuple[PatchBatch, PixelBatch]:
         """Everything step `step` needs."""
         inputs = self.input_ids(step)
         targets = self.target_ids(step, inputs)
-        pixels = pixel_batch(
-            [self.cache[patch_id] for patch_id in targets], rays_per_patch, generator_for(self.seed, step, "pixels")
-        )
-        return patch_batch([self.cache[patch_id] for patch_id in inputs]), pixels
+        flips = self.mirrored(step)
+        shown = [self._patch(patch_id, flip[0]) for patch_id, flip in zip(inputs, flips, strict=True)]
+        explained = [self._patch(patch_id, flip[1]) for patch_id, flip in zip(targets, flips, strict=True)]
+        pixels = pixel_batch(explained, rays_per_patch, generator_for(self.seed, step, "pixels"))
+        return patch_batch(shown), pixels
+
+    def _patch(self, patch_id: str, is_mirrored: bool) -> PreparedPatch:
+        return mirror_patch(self.cache[patch_id]) if is_mirrored else self.cache[patch_id]

@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save
 
 from carstudio.errors import InputError
-from carstudio.files import read_json, sha256_file, write_bytes, write_json
+from carstudio.files import read_json, sha256_file, write_json
 from carstudio.models.interface import CategoryModel
 from carstudio.models.zoo import ModelConfig, build_model, config_from_json, config_to_json
+from carstudio.tensors import load_tensors, save_tensors
 
 FORMAT_VERSION = 1
 WEIGHTS, DESCRIPTION = "model.safetensors", "model.json"
@@ -53,23 +52,6 @@ def save_model(folder: Path, model: CategoryModel, config: ModelConfig, provenan
     }
     write_json(folder / DESCRIPTION, value)
     return checksum
-
-
-def save_tensors(path: Path, tensors: dict[str, torch.Tensor], metadata: dict[str, str] | None = None) -> None:
-    """Write tensors as safetensors, atomically."""
-    on_cpu = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    # Not safetensors' own `save_file`: it writes to a temporary name of its own, which a kill leaves behind.
-    write_bytes(path, save(on_cpu, metadata=metadata))
-
-
-def load_tensors(path: Path) -> dict[str, torch.Tensor]:
-    """Read a safetensors file; `InputError` when it is missing, cut short or something else."""
-    try:
-        return load_file(path)
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file; expected the weights of a model") from error
-    except (SafetensorError, OSError, ValueError) as error:
-        raise InputError(f"{path}: not a whole safetensors file ({error}); train again or copy it again") from error
 
 
 def describe_model(folder: Path | str) -> ModelDescription:

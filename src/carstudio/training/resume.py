@@ -11,7 +11,8 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from carstudio.errors import InputError
-from carstudio.training.checkpoint import load_tensors, load_weights, save_tensors
+from carstudio.tensors import load_tensors, save_tensors
+from carstudio.training.checkpoint import load_weights
 
 STATE = "training.safetensors"
 SLOTS = ("step", "exp_avg", "exp_avg_sq")  # what RAdam keeps of each parameter; step is one number

@@ -21,8 +21,7 @@ from carstudio.models.interface import CategoryModel
 from carstudio.models.zoo import ModelConfig, build_model
 from carstudio.progress import Report, silent
 from carstudio.rendering.rays import to_canonical
-from carstudio.rendering.volume import composite
-from carstudio.training.batches import StepSampler, Supervision, generator_for
+from carstudio.training.batches import Mirroring, StepSampler, Supervision, generator_for
 from carstudio.training.checkpoint import describe_model, load_weights_of, save_model
 from carstudio.training.log import LOG, TrainingLog
 from carstudio.training.losses import LossConfig, masked_psnr, training_loss
@@ -45,6 +44,8 @@ class TrainConfig:
     """Learning rate."""
     supervision: Supervision = "single-view"
     """Which photo of the car an encoded photo must explain."""
+    mirroring: Mirroring = "off"
+    """Whether photos are flipped left to right half of the time: never, input and explained photo alike, or each."""
     patches_per_step: int = 3
     """Cars encoded per step."""
     rays_per_patch: int = 1024
@@ -176,6 +177,7 @@ class _Run:
             patches_per_step=config.patches_per_step,
             supervision=config.supervision,
             seed=config.seed,
+            mirroring=config.mirroring,
         )
 
     def begin(self, *, init: Path | None) -> None:
@@ -227,8 +229,7 @@ class _Run:
         self.model.train()
         with autocast(config.precision, self.device):
             latents = self.model.encode(patches)
-            levels = self.model.trace_levels(pixels.rays, latents, pixels.box, jitter)
-        renderings = tuple(composite(segments) for segments in levels)
+            renderings = self.model.render_levels(pixels.rays, latents, pixels.box, jitter)
         counts = pixels.is_known & to_canonical(pixels.rays, pixels.box).hit
         terms = training_loss(renderings, pixels.rgb, pixels.alpha, counts, config.loss)
         loss = torch.stack(list(terms.values())).sum()

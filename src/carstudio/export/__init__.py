@@ -1,0 +1,1 @@
+"""Cars in formats that other programs open."""

@@ -1,0 +1,1 @@
+"""One car's latents, found from its photographs and kept in a file."""

@@ -1,0 +1,202 @@
+"""Cars as Gaussians in the canonical box, decoded in one go from two codes.
+
+The shape code places the Gaussians (offsets to a learned template), the texture code colours them; the shape code
+reaches the colours detached, so a recoloured car keeps its shape to the bit and colour errors do not bend it.
+"""
+
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from carstudio.geometry.box3d import Box3D
+from carstudio.models.encoders import EncoderConfig, build_encoder, load_imagenet
+from carstudio.models.gaussian_template import surface_template
+from carstudio.models.interface import CategoryModel, Latents, PatchBatch
+from carstudio.models.patch_features import POSE_FEATURES, pose_features, tiny_masked_copy
+from carstudio.models.photo_features import PHOTO_FEATURES, photo_at
+from carstudio.rendering.gaussians.cloud import GaussianCloud
+from carstudio.rendering.gaussians.tracing import SplattingConfig, render_cloud, trace_cloud
+from carstudio.rendering.rays import Rays, to_canonical
+from carstudio.rendering.volume import Rendering, Segments
+
+
+@dataclass(frozen=True)
+class CarGaussiansConfig:
+    """Sizes of the Gaussian model."""
+
+    encoder: EncoderConfig = field(
+        default_factory=lambda: EncoderConfig(
+            kind="small", side_px=64, pretrained=None, num_features=256, sees_mask=True
+        )
+    )
+    """Photo to features."""
+    splatting: SplattingConfig = field(default_factory=SplattingConfig)
+    """How rays meet Gaussians."""
+    num_splats: int = 512
+    """Gaussians of a car."""
+    code_size: int = 128
+    """Length of each of the two codes."""
+    width: int = 256
+    """Hidden width of the two decoders."""
+    is_symmetric: bool = True
+    """Gaussians come in pairs mirrored in the car's middle plane; colours are free."""
+    colour_skip_px: int = 8
+    """Side of a tiny copy of the masked crop, added to the texture code by a linear map; 0: none."""
+    sees_photo: bool = True
+    """Look up each Gaussian's place (and its mirror image's) in the photo; the findings lengthen the texture code."""
+    embedding: int = 16
+    """Length of what the colour decoder knows about each Gaussian."""
+    least_scale: float = 0.01
+    """Smallest standard deviation of a Gaussian, canonical units."""
+    largest_scale: float = 0.5
+    """Largest standard deviation, canonical units."""
+
+
+class CarGaussians(CategoryModel):
+    """Encoder, two codes, two decoders."""
+
+    def __init__(self, config: CarGaussiansConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.encoder_side_px = config.encoder.side_px
+        self.encoder = build_encoder(config.encoder)
+        num_features = config.encoder.num_features + POSE_FEATURES
+        self.shape_head = nn.Linear(num_features, config.code_size)
+        self.texture_head = nn.Linear(num_features, config.code_size)
+        self.shape_norm, self.texture_norm = nn.LayerNorm(config.code_size), nn.LayerNorm(config.code_size)
+        if config.colour_skip_px:
+            self.colour_skip = nn.Linear(3 * config.colour_skip_px**2, config.code_size)
+        self.geometry = GeometryDecoder(config)
+        self.colour = ColourDecoder(config)
+
+    def load_pretrained_parts(self) -> str:
+        """ImageNet weights for the encoder where the config asks for them and they can be had."""
+        return load_imagenet(self.encoder, self.config.encoder)
+
+    def encode(self, patches: PatchBatch) -> Latents:
+        """Codes of shape and texture."""
+        features = torch.cat([self.encoder(patches.image, patches.mask), pose_features(patches)], dim=-1)
+        texture = self.texture_head(features)
+        if self.config.colour_skip_px:
+            texture = texture + self.colour_skip(tiny_masked_copy(patches, self.config.colour_skip_px))
+        shape, texture = self.shape_norm(self.shape_head(features)), self.texture_norm(texture)
+        if self.config.sees_photo:
+            with torch.no_grad(), torch.autocast(patches.image.device.type, enabled=False):
+                mean = self.geometry(shape.to(patches.image.dtype))[0]
+                texture = torch.cat([texture, photo_at(mean, patches).flatten(1).to(texture.dtype)], dim=-1)
+        return Latents(shape, texture)
+
+    def decode(self, latents: Latents) -> GaussianCloud:
+        """The car's Gaussians in the canonical frame."""
+        mean, log_scale, quaternion, opacity = self.geometry(latents.shape)
+        return GaussianCloud(mean, log_scale, quaternion, opacity, self.colour(latents))
+
+    def trace_levels(
+        self, rays: Rays, latents: Latents, box: Box3D, generator: torch.Generator | None = None
+    ) -> tuple[Segments, ...]:
+        """The Gaussians along each ray, one level; nothing is random."""
+        with torch.autocast(rays.directions.device.type, enabled=False):
+            cloud = self.decode(_exact(latents, rays))
+            return (trace_cloud(cloud, rays, to_canonical(rays, box), self.config.splatting),)
+
+    def render_levels(
+        self, rays: Rays, latents: Latents, box: Box3D, generator: torch.Generator | None = None
+    ) -> tuple[Rendering, ...]:
+        """The composite of `trace_levels`, by the shorter way."""
+        with torch.autocast(rays.directions.device.type, enabled=False):
+            cloud = self.decode(_exact(latents, rays))
+            return (render_cloud(cloud, rays, to_canonical(rays, box), self.config.splatting),)
+
+
+def _exact(latents: Latents, rays: Rays) -> Latents:
+    """Codes in the rays' precision: places of Gaussians do not bear bfloat16."""
+    return Latents(latents.shape.to(rays.directions.dtype), latents.texture.to(rays.directions.dtype))
+
+
+OFFSETS = {"mean": 3, "log_scale": 3, "quaternion": 4, "opacity": 1}
+
+
+class GeometryDecoder(nn.Module):
+    """Shape code to means, scales, rotations and opacities: a learned template plus offsets."""
+
+    def __init__(self, config: CarGaussiansConfig) -> None:
+        super().__init__()
+        assert not config.is_symmetric or config.num_splats % 2 == 0, "mirrored pairs need an even number"
+        self.config = config
+        count = config.num_splats // 2 if config.is_symmetric else config.num_splats
+        self.hidden = nn.Sequential(nn.Linear(config.code_size, config.width), nn.SiLU())
+        self.offsets = nn.Linear(config.width, count * sum(OFFSETS.values()))
+        nn.init.normal_(self.offsets.weight, std=0.02 / config.width**0.5)
+        nn.init.zeros_(self.offsets.bias)
+        template = surface_template(count, is_half=config.is_symmetric)
+        span = torch.tensor(config.largest_scale / config.least_scale).log()
+        scale = (template.log_scale - torch.tensor(config.least_scale).log()) / span
+        self.mean = nn.Parameter(torch.atanh(template.mean))
+        self.scale = nn.Parameter(torch.logit(scale.clamp(0.02, 0.98)))
+        self.quaternion = nn.Parameter(template.quaternion)
+        self.opacity = nn.Parameter(torch.full((count,), 1.0))
+
+    def forward(
+        self, shape: Float[Tensor, "batch code"]
+    ) -> tuple[
+        Float[Tensor, "batch splat 3"],
+        Float[Tensor, "batch splat 3"],
+        Float[Tensor, "batch splat 4"],
+        Float[Tensor, "batch splat"],
+    ]:
+        """Means, log scales, quaternions and opacities."""
+        offsets = self.offsets(self.hidden(shape)).unflatten(-1, (-1, sum(OFFSETS.values())))
+        mean, scale, quaternion, opacity = offsets.split(list(OFFSETS.values()), dim=-1)
+        mean = torch.tanh(self.mean + mean)
+        least, largest = self.mean.new_tensor([self.config.least_scale, self.config.largest_scale]).log()
+        log_scale = least + (largest - least) * torch.sigmoid(self.scale + scale)
+        quaternion = nn.functional.normalize(self.quaternion + quaternion, dim=-1)
+        opacity = torch.sigmoid(self.opacity + opacity.squeeze(-1))
+        if self.config.is_symmetric:
+            half = GaussianCloud(mean, log_scale, quaternion, opacity, mean)
+            other = half.mirrored()
+            mean, quaternion = torch.cat([mean, other.mean], dim=1), torch.cat([quaternion, other.quaternion], dim=1)
+            log_scale, opacity = torch.cat([log_scale, log_scale], dim=1), torch.cat([opacity, opacity], dim=1)
+        return mean, log_scale, quaternion, opacity
+
+
+class ColourDecoder(nn.Module):
+    """Texture code (and the detached shape code) to a colour per Gaussian.
+
+    Where the photo was looked up, the colour is a mix of what the code says, what the photo shows at the Gaussian and
+    what it shows at the Gaussian's mirror image.
+    """
+
+    def __init__(self, config: CarGaussiansConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.hidden = nn.Sequential(nn.Linear(2 * config.code_size, config.width), nn.SiLU())
+        self.colours = nn.Linear(config.width, config.num_splats * 3)
+        if config.sees_photo:
+            self.embedding = nn.Parameter(torch.randn(config.num_splats, config.embedding))
+            self.context = nn.Linear(config.width, config.embedding)
+            self.mix = nn.Sequential(
+                nn.Linear(2 * PHOTO_FEATURES + 2 * config.embedding, 64), nn.SiLU(), nn.Linear(64, 6)
+            )
+
+    def forward(self, latents: Latents) -> Float[Tensor, "batch splat 3"]:
+        """Rgb in [0, 1]."""
+        code = latents.texture[:, : self.config.code_size]
+        hidden = self.hidden(torch.cat([code, latents.shape.detach()], dim=-1))
+        colours = self.colours(hidden).unflatten(-1, (-1, 3))
+        if not self.config.sees_photo:
+            return torch.sigmoid(colours)
+        photo = latents.texture[:, self.config.code_size :].unflatten(-1, (-1, PHOTO_FEATURES))
+        other = photo.roll(self.config.num_splats // 2, dims=1)
+        context = self.context(hidden)[:, None].expand(-1, self.config.num_splats, -1)
+        known = torch.cat([photo, other, context, self.embedding.expand(len(code), -1, -1)], dim=-1)
+        mixed = self.mix(known)
+        own = torch.sigmoid(colours + mixed[..., :3])
+        share = mixed[..., 3:].softmax(dim=-1) * torch.stack(
+            [torch.ones_like(photo[..., 3]), photo[..., 3], other[..., 3]], dim=-1
+        )
+        share = share / share.sum(dim=-1, keepdim=True)
+        seen, mirrored = (found[..., :3] / found[..., 3:].clamp(min=1e-3) for found in (photo, other))
+        return share[..., :1] * own + share[..., 1:2] * seen + share[..., 2:] * mirrored

@@ -1,0 +1,1 @@
+"""Cars made of anisotropic Gaussians in the canonical frame, met by rays in closed form."""

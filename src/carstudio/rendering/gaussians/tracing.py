@@ -1,0 +1,84 @@
+"""A cloud of Gaussians in a car's box, traced along metric rays."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from carstudio.rendering.gaussians.cloud import GaussianCloud, Splats, splats_of, widened_splats
+from carstudio.rendering.gaussians.compositing import composite_hits
+from carstudio.rendering.gaussians.hits import ray_hits
+from carstudio.rendering.gaussians.reference import sorted_responses
+from carstudio.rendering.rays import CanonicalRays, Rays
+from carstudio.rendering.volume import Rendering, Segments
+
+
+@dataclass(frozen=True)
+class SplattingConfig:
+    """How rays meet Gaussians."""
+
+    most: int = 32
+    """Gaussians a ray may hit; those behind are left out (by then hardly any light is left)."""
+    widen: bool = True
+    """Widen Gaussians by the pixel's footprint, so that far and small pictures neither shimmer nor thin out."""
+    is_reference: bool = False
+    """Take the slow, plain path through all Gaussians."""
+
+
+def trace_cloud(cloud: GaussianCloud, rays: Rays, canonical: CanonicalRays, config: SplattingConfig) -> Segments:
+    """Segments of the Gaussians that each ray meets, from front to back; none where a ray misses the box.
+
+    All metric: the peak's distance along the ray, its depth, its alpha; rgb is the Gaussian's.
+    """
+    alpha, t, index, middle = _hits(cloud, canonical, config)
+    distance = (t + middle[..., None]) / canonical.stretch[..., None]
+    flat = (index + cloud.rgb.shape[1] * torch.arange(len(index), device=index.device)[:, None, None]).flatten()
+    rgb = cloud.rgb.flatten(0, 1).index_select(0, flat).unflatten(0, index.shape)
+    return Segments(distance, distance * rays.directions[..., 2:], alpha, rgb)
+
+
+def render_cloud(cloud: GaussianCloud, rays: Rays, canonical: CanonicalRays, config: SplattingConfig) -> Rendering:
+    """What `composite` makes of `trace_cloud`'s segments, without laying out the segments' colours."""
+    alpha, t, index, middle = _hits(cloud, canonical, config)
+    rgb, sums, weights = composite_hits(alpha, t, index, cloud.rgb)
+    opacity = sums[..., 0]
+    distance = (sums[..., 1] / opacity.clamp(min=1e-8) + middle * (opacity > 0)) / canonical.stretch
+    return Rendering(rgb, opacity, distance, distance * rays.directions[..., 2], weights)
+
+
+def _hits(
+    cloud: GaussianCloud, canonical: CanonicalRays, config: SplattingConfig
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """alpha, t and number of each hit; t counts from the ray's point nearest the box's centre, `middle` away."""
+    splats = splats_seen(cloud, canonical) if config.widen else splats_of(cloud)
+    directions = canonical.view_directions
+    middle = -(canonical.origins * directions).sum(dim=-1)
+    points = canonical.origins + middle[..., None] * directions
+    if config.is_reference:
+        alpha, t, index = sorted_responses(splats, points, directions, -middle)
+    else:
+        alpha, t, index = ray_hits(splats, points, directions, -middle, most=config.most)
+    return alpha * canonical.hit[..., None], t, index, middle
+
+
+def splats_seen(cloud: GaussianCloud, canonical: CanonicalRays) -> Splats:
+    """Splats as wide as the rays' cones at them make them.
+
+    One camera per batch entry is assumed here: the mean of the rays' origins and radii stands for all.
+    """
+    eye = canonical.origins.mean(dim=1)
+    metric = (cloud.mean - eye[:, None]) @ torch.linalg.inv(canonical.linear).mT
+    radius = canonical.radii.mean(dim=1)[:, None] * metric.norm(dim=-1)
+    footprint = footprint_variance(radius, canonical.linear)
+    return widened_splats(cloud, eye, footprint)
+
+
+def footprint_variance(
+    radius_m: Float[Tensor, "batch splat"], linear: Float[Tensor, "batch 3 3"]
+) -> Float[Tensor, "batch splat 3"]:
+    """Canonical variance of a disc of that radius, r^2 / 4 on each axis (mip-NeRF Eq. 8), through A diag A^T.
+
+    A is diag(2 / size) times a rotation, so A A^T is diagonal.
+    """
+    return (radius_m**2 / 4)[..., None] * (linear**2).sum(dim=-1)[:, None]

@@ -1,0 +1,137 @@
+"""Fitting: what stays stays to the bit, what is fitted gets better, a batch is as good as one."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from carstudio.cli import run
+from carstudio.commands.fit import objective, photographs_of
+from carstudio.commands.opening import open_car
+from carstudio.dataset.pixels import PatchCache
+from carstudio.dataset.store import PatchStore
+from carstudio.errors import InputError
+from carstudio.fitting.car_file import load_car
+from carstudio.fitting.optimise import FitConfig, FitPixels, Fitted, field_parameters, fit
+from carstudio.models.interface import CategoryModel, Latents
+from carstudio.training.batches import generator_for, patch_batch, pixel_batch
+from carstudio.training.checkpoint import load_model
+from carstudio.training.trainer import train
+from training.toy import TINY, toy_store
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> PatchStore:
+    return toy_store(tmp_path_factory.mktemp("toy") / "store")
+
+
+@pytest.fixture(scope="module")
+def trained(store: PatchStore, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("toy") / "run"
+    train(TINY, store, out, device="cpu")
+    return out
+
+
+def cars(store: PatchStore) -> list[str]:
+    return sorted(set(store.table(["instance_id"])["instance_id"].to_pylist()))
+
+
+def fit_cars(
+    model: CategoryModel, store: PatchStore, names: list[str], config: FitConfig, looks: bool = False
+) -> Fitted:
+    """Cars in one batch, each with the pixels that it would be shown alone."""
+    cache = PatchCache(store, model.encoder_side_px)
+    groups = [[cache[patch_id] for patch_id in photographs_of(store, name, None)] for name in names]
+    with torch.no_grad():
+        each = [model.encode(patch_batch(group)) for group in groups]
+    start = Latents(*(torch.stack([getattr(one, kind).mean(0) for one in each]) for kind in ("shape", "texture")))
+
+    def draw(step: int) -> FitPixels:
+        parts = [pixel_batch(group, 48, generator_for(0, step, "pixels")) for group in groups]
+        rays = type(parts[0].rays)(
+            *(torch.cat([getattr(p.rays, k) for p in parts]) for k in ("origins", "directions", "radii"))
+        )
+        box = type(parts[0].box)(
+            *(torch.cat([getattr(p.box, k) for p in parts]) for k in ("center", "size", "rotation"))
+        )
+        joined = (torch.cat([getattr(p, k) for p in parts]) for k in ("rgb", "alpha", "is_known"))
+        owner = torch.cat([torch.full((len(group),), i) for i, group in enumerate(groups)])
+        return FitPixels(rays, box, *joined, owner)
+
+    return fit(model, start, draw, objective, config, held_out=draw(10**6) if looks else None)
+
+
+def test_zero_steps_keep_the_encoders_latents(store: PatchStore, trained: Path) -> None:
+    model = load_model(trained)
+    name = cars(store)[0]
+    found = fit_cars(model, store, [name], FitConfig(steps=0))
+    cache = PatchCache(store, model.encoder_side_px)
+    with torch.no_grad():
+        each = model.encode(patch_batch([cache[patch_id] for patch_id in photographs_of(store, name, None)]))
+    assert torch.equal(found.latents.shape, each.shape.mean(0, keepdim=True))
+    assert (found.weights, found.curve, found.steps) == ({}, (), 0)
+
+
+def test_latents_get_better_and_the_model_stays_to_the_bit(store: PatchStore, trained: Path) -> None:
+    model = load_model(trained)
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    found = fit_cars(model, store, [cars(store)[1]], FitConfig(steps=30, latent_rate=0.05), looks=True)
+    assert found.weights == {}
+    assert min(value for _, value in found.curve) < 0.985 * found.curve[0][1]
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+    assert all(parameter.requires_grad for parameter in model.parameters())
+
+
+def test_the_field_is_fitted_in_a_copy_and_does_more(store: PatchStore, trained: Path) -> None:
+    model = load_model(trained)
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    name = cars(store)[1]
+    latents = fit_cars(model, store, [name], FitConfig(steps=30), looks=True)
+    both = fit_cars(model, store, [name], FitConfig(steps=30, field_rate=5e-3), looks=True)
+    assert min(v for _, v in both.curve) < min(v for _, v in latents.curve)
+    assert all(torch.equal(value, before[key]) for key, value in model.state_dict().items())
+    assert both.weights.keys() == {key for key, _ in field_parameters(model)}
+    assert not any(key.startswith("encoder.") for key in both.weights)
+
+
+def test_a_car_in_a_batch_is_fitted_as_alone(store: PatchStore, trained: Path) -> None:
+    model, config = load_model(trained), FitConfig(steps=8)
+    names = cars(store)[:3]
+    together = fit_cars(model, store, names, config)
+    for index, name in enumerate(names):
+        alone = fit_cars(model, store, [name], config)
+        torch.testing.assert_close(together.latents.shape[index], alone.latents.shape[0], rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(together.latents.texture[index], alone.latents.texture[0], rtol=1e-4, atol=1e-5)
+
+
+def test_fitting_stops_when_held_out_pixels_get_no_better(store: PatchStore, trained: Path) -> None:
+    model = load_model(trained)
+    config = FitConfig(steps=500, latent_rate=2.0, patience=2, look_every=1)
+    found = fit_cars(model, store, [cars(store)[0]], config, looks=True)
+    assert found.steps < 500
+    values = [value for _, value in found.curve]
+    assert min(values) <= values[0]
+    assert values[-1] >= min(values)
+
+
+def test_the_verb_writes_a_car_that_opens_with_its_model_alone(
+    store: PatchStore, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = cars(store)[0]
+    command = ["fit", str(trained), "--data", str(store.path), "--instance", name, "--out", str(tmp_path / "car")]
+    assert run([*command, "--steps", "5", "--field-rate", "1e-3", "--device", "cpu", "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    assert said["instance_id"] == name
+    assert len(said["patches"]) > 1
+    car = load_car(tmp_path / "car")
+    assert (car.model_name, car.licence) == ("tiny", "CC0-1.0")
+    model, again = open_car(tmp_path / "car", trained)
+    assert torch.equal(again.latents.shape, car.latents.shape)
+    assert torch.equal(model.state_dict()["field.density.weight"], car.weights["field.density.weight"])
+    other = tmp_path / "other"
+    train(TINY.__class__(**{**vars(TINY), "seed": 1, "steps": 1}), store, other, device="cpu")
+    with pytest.raises(InputError, match=r"not the model that .* was made with"):
+        open_car(tmp_path / "car", other)
+    with pytest.raises(InputError, match="no kept photograph with a 3-D box of 'nobody'"):
+        photographs_of(store, "nobody", None)

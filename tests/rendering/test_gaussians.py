@@ -1,0 +1,319 @@
+"""Rays and Gaussians: closed forms against dense sampling, the fast path against the plain one, and geometry."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from carstudio.geometry.box3d import Box3D, mirror_box
+from carstudio.geometry.camera import Camera
+from carstudio.geometry.canonical import canonical_from_camera
+from carstudio.geometry.orbit import orbit_box, orbit_camera
+from carstudio.geometry.transforms import rotation_from_quaternion
+from carstudio.models.gaussian_template import surface_template
+from carstudio.rendering.gaussians import hits
+from carstudio.rendering.gaussians.cloud import GaussianCloud, Splats, invert_symmetric, splats_of, widened_splats
+from carstudio.rendering.gaussians.reference import MAX_ALPHA, responses, sorted_responses
+from carstudio.rendering.gaussians.tracing import SplattingConfig, render_cloud, trace_cloud
+from carstudio.rendering.rays import Rays, image_rays, to_canonical
+from carstudio.rendering.volume import Rendering, composite, merge_segments
+from rendering.scenes import batched, kitti_camera, positions_on_box, tilted_box
+
+FAST, REFERENCE = SplattingConfig(most=200), SplattingConfig(is_reference=True)
+
+
+def random_cloud(count: int = 60, dtype: torch.dtype = torch.float64, seed: int = 0) -> GaussianCloud:
+    generator = torch.Generator().manual_seed(seed)
+    draw = torch.rand(1, count, 14, generator=generator, dtype=torch.float64).to(dtype)
+    quaternion = draw[..., 6:10] * 2 - 1
+    return GaussianCloud(
+        draw[..., :3] * 1.6 - 0.8, (draw[..., 3:6] * 0.2 + 0.03).log(), quaternion, draw[..., 10], draw[..., 11:]
+    )
+
+
+def surface_cloud(count: int = 400, dtype: torch.dtype = torch.float64) -> GaussianCloud:
+    """Like a trained car: nearly opaque thin discs on a closed surface."""
+    template = surface_template(count, is_half=False)
+    colours = torch.rand(1, count, 3, generator=torch.Generator().manual_seed(3))
+    parts = template.mean[None], template.log_scale[None], template.quaternion[None], torch.full((1, count), 0.95)
+    return GaussianCloud(*(part.to(dtype) for part in (*parts, colours)))
+
+
+def car_box(
+    dtype: torch.dtype = torch.float64, azimuth_deg: float = 35.0, distance_m: float = 9.0, elevation_deg: float = 10.0
+) -> Box3D:
+    box = orbit_box(
+        torch.tensor([4.2, 1.55, 1.8]), azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, distance_m=distance_m
+    )
+    return Box3D(box.center[None].to(dtype), box.size[None].to(dtype), box.rotation[None].to(dtype))
+
+
+def camera(side: int, dtype: torch.dtype = torch.float64) -> Camera:
+    return Camera(orbit_camera(side).intrinsics.to(dtype), side, side)
+
+
+def picture(cloud: GaussianCloud, box: Box3D, view: Camera, config: SplattingConfig = REFERENCE) -> Rendering:
+    rays = image_rays(view)
+    return composite(trace_cloud(cloud, rays, to_canonical(rays, box), config))
+
+
+def leaves(cloud: GaussianCloud) -> list[Tensor]:
+    return [value.clone().requires_grad_() for value in vars(cloud).values()]
+
+
+def test_peaks_are_the_maxima_along_the_ray() -> None:
+    """Against the response sampled densely along each ray, its exponent written out with a matrix inverse."""
+    cloud = random_cloud(12)
+    box, view = tilted_box(), kitti_camera()
+    rays = to_canonical(_rays(view, box, 20), box)
+    middle = -(rays.origins * rays.view_directions).sum(-1)
+    points = rays.origins + middle[..., None] * rays.view_directions
+    alpha, t = responses(splats_of(cloud), points, rays.view_directions)
+    at = torch.linspace(-4, 4, 8001, dtype=torch.float64)
+    x = points[0, :, None, None] + at[:, None] * rays.view_directions[0, :, None, None] - cloud.mean[0, None, :, None]
+    inverse = torch.linalg.inv(cloud.covariance()[0])
+    exponent = torch.einsum("rnti,nij,rntj->rnt", x, inverse, x)
+    found, place = (cloud.opacity[0, :, None] * torch.exp(-exponent / 2)).max(dim=-1)
+    assert torch.allclose(alpha[0], found.clamp(max=MAX_ALPHA), atol=1e-3)  # 0.001 apart: a slope of 1 / (2 * 0.03)
+    seen = found > 1e-3
+    assert torch.allclose(t[0][seen], at[place][seen], atol=6e-4)
+
+
+def _rays(view: Camera, box: Box3D, count: int) -> Rays:
+    from carstudio.rendering.rays import pixel_rays
+
+    return pixel_rays(batched(view), positions_on_box(box, view, count))
+
+
+def test_cofactors_invert() -> None:
+    matrix = random_cloud(30).covariance()
+    inverse, determinant = invert_symmetric(matrix)
+    assert torch.allclose(inverse, torch.linalg.inv(matrix), rtol=1e-9)
+    assert torch.allclose(determinant, torch.linalg.det(matrix), rtol=1e-9)
+
+
+def test_the_plain_path_has_the_gradients_of_its_values() -> None:
+    box, view = car_box(), camera(4)
+    rays = image_rays(view)
+    canonical = to_canonical(rays, box)
+
+    def render(*parts: Tensor) -> tuple[Tensor, Tensor]:
+        cloud = GaussianCloud(parts[0], parts[1], parts[2], parts[3].sigmoid(), parts[4])
+        found = composite(trace_cloud(cloud, rays, canonical, REFERENCE))
+        return found.rgb, found.opacity
+
+    assert torch.autograd.gradcheck(render, leaves(random_cloud(5)), atol=1e-6)
+
+
+def test_the_fast_path_has_the_gradients_of_its_values() -> None:
+    """The closed-form backward, alpha and t, in float64 (two kinks, the faintest hit and the cap, stay clear of it)."""
+    cloud = random_cloud(6, seed=4)
+    rays = to_canonical(image_rays(camera(4)), car_box())
+    middle = -(rays.origins * rays.view_directions).sum(-1)
+    points = rays.origins + middle[..., None] * rays.view_directions
+
+    def found(mean: Tensor, log_scale: Tensor, quaternion: Tensor, opacity: Tensor) -> tuple[Tensor, Tensor]:
+        splats = splats_of(GaussianCloud(mean, log_scale, quaternion, opacity.sigmoid(), mean))
+        alpha, t, _ = hits.ray_hits(splats, points, rays.view_directions, -middle, most=4)
+        return alpha, t
+
+    assert bool((found(*leaves(cloud)[:4])[0] > 0).any())
+    assert torch.autograd.gradcheck(found, leaves(cloud)[:4], atol=1e-6)
+
+
+@pytest.mark.parametrize("make", [random_cloud, surface_cloud])
+@pytest.mark.parametrize("chunk", [2**9, 2**17])
+def test_the_fast_path_equals_the_plain_one(make, chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """float32 against float64. Left out are alphas below 1/512: a step of 8 bit in a pixel, 2e-4 on the whole."""
+    monkeypatch.setitem(hits._CHUNK, "cpu", chunk)
+    weights = torch.randn(1, 32 * 32, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    results = []
+    for dtype, config in ((torch.float64, REFERENCE), (torch.float32, FAST)):
+        parts = leaves(make(dtype=dtype))
+        found = picture(GaussianCloud(*parts), car_box(dtype), camera(32, dtype), config)
+        loss = (found.rgb * weights.to(dtype)).sum() + found.opacity.square().sum()
+        loss = loss + (found.depth_m * (found.opacity.detach() > 0.5)).sum()
+        results.append((found, torch.autograd.grad(loss, parts)))
+    (plain, plain_gradients), (fast, fast_gradients) = results
+    for name, worst, mean in (("rgb", 1.5e-2, 5e-4), ("opacity", 1.5e-2, 5e-4)):
+        error = (getattr(plain, name) - getattr(fast, name)).abs()
+        assert float(error.max()) < worst, name
+        assert float(error.mean()) < mean, name
+    solid = plain.opacity > 0.5
+    assert float((plain.depth_m - fast.depth_m)[solid].abs().max()) < 0.03
+    for plain_gradient, fast_gradient in zip(plain_gradients, fast_gradients, strict=True):
+        assert float((plain_gradient - fast_gradient).norm() / plain_gradient.norm()) < 0.05
+
+
+@pytest.mark.parametrize("make", [random_cloud, surface_cloud])
+def test_the_short_way_equals_compositing_the_segments(make) -> None:
+    """Values and gradients, colour, opacity and depth, in float64."""
+    rays = image_rays(camera(12))
+    canonical = to_canonical(rays, car_box())
+    weights = torch.randn(1, 144, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    results = []
+    for is_short in (False, True):
+        parts = leaves(make())
+        cloud = GaussianCloud(*parts)
+        segments = (rays, canonical, FAST)
+        found = render_cloud(cloud, *segments) if is_short else composite(trace_cloud(cloud, *segments))
+        solid = found.opacity.detach() > 1e-3
+        loss = (found.rgb * weights).sum() + found.opacity.square().sum() + (found.depth_m * solid).sum()
+        results.append((found, torch.autograd.grad(loss, parts)))
+    (plain, plain_gradients), (short, short_gradients) = results
+    solid = plain.opacity > 1e-3
+    assert torch.allclose(plain.rgb, short.rgb, atol=1e-12)
+    assert torch.allclose(plain.opacity, short.opacity, atol=1e-12)
+    assert torch.allclose(plain.depth_m[solid], short.depth_m[solid], atol=1e-9)
+    assert torch.allclose(plain.distance_m[solid], short.distance_m[solid], atol=1e-9)
+    for a, b in zip(plain_gradients, short_gradients, strict=True):
+        assert float((a - b).norm()) < 1e-9 * float(a.norm())
+
+
+def test_only_what_lies_behind_is_left_out() -> None:
+    """With fewer hits allowed the front ones are the same to the bit."""
+    rays = image_rays(camera(24, torch.float32))
+    canonical = to_canonical(rays, car_box(torch.float32))
+    cloud = surface_cloud(dtype=torch.float32)
+    whole, few = (trace_cloud(cloud, rays, canonical, SplattingConfig(most=most)) for most in (100, 16))
+    for name in ("alpha", "distance_m", "rgb"):
+        assert torch.equal(getattr(whole, name)[:, :, :16], getattr(few, name)), name
+    assert bool((whole.alpha[..., 16] > 0).any())
+
+
+def test_a_metric_scene_looks_like_its_canonical_one() -> None:
+    """The same Gaussians written in metres in the camera frame: same alphas, peaks at the same metric distance."""
+    box, view = tilted_box(), kitti_camera()
+    rays, cloud = _rays(view, box, 30), random_cloud(20)
+    canonical = to_canonical(rays, box)
+    inverse = torch.linalg.inv(canonical_from_camera(box)[0])
+    linear = inverse[:3, :3]
+    mean = cloud.mean @ linear.mT + inverse[:3, 3]
+    metric = Splats(mean, torch.linalg.inv(linear @ cloud.covariance() @ linear.mT), cloud.opacity)
+    alpha, distance, _ = sorted_responses(metric, rays.origins, rays.directions, torch.zeros_like(rays.radii))
+    found = trace_cloud(cloud, rays, canonical, replace(REFERENCE, widen=False))
+    assert torch.allclose(found.alpha, alpha, atol=1e-9)
+    assert torch.allclose(found.distance_m, distance, atol=1e-9)
+
+
+def one_gaussian(mean: tuple[float, float, float], rgb: tuple[float, float, float], scale: float) -> GaussianCloud:
+    as_batch = lambda *values: torch.tensor([[values]], dtype=torch.float64)  # noqa: E731
+    opacity = torch.full((1, 1), 0.999, dtype=torch.float64)
+    return GaussianCloud(
+        as_batch(*mean), as_batch(scale, scale, scale).log(), as_batch(1.0, 0.0, 0.0, 0.0), opacity, as_batch(*rgb)
+    )
+
+
+def join(*clouds: GaussianCloud) -> GaussianCloud:
+    return GaussianCloud(*(torch.cat(parts, dim=1) for parts in zip(*(vars(c).values() for c in clouds), strict=True)))
+
+
+@pytest.mark.parametrize("config", [REFERENCE, FAST])
+def test_a_ray_through_a_gaussian_sees_it_at_its_depth(config: SplattingConfig) -> None:
+    box, mean = car_box(), (0.3, -0.2, 0.5)
+    center = (torch.tensor(mean, dtype=torch.float64) * box.size / 2) @ box.rotation[0].mT + box.center
+    wide = camera(64)
+    view = wide.crop(0, 0, 1, 1)
+    pixel = wide.project(center[None])[0, 0]
+    view = Camera(
+        view.intrinsics
+        - torch.tensor([0.0, 0.0, 1.0, 1.0], dtype=torch.float64) * torch.cat([torch.zeros(2), pixel - 0.5]),
+        1,
+        1,
+    )
+    found = picture(one_gaussian(mean, (1.0, 0.5, 0.0), 0.05), box, view, replace(config, widen=False))
+    assert float(found.depth_m) == pytest.approx(float(center[0, 2]), abs=2e-3)
+    assert float(found.opacity) == pytest.approx(0.999, abs=1e-4)
+    assert torch.allclose(found.rgb[0, 0] / found.opacity[0, 0], torch.tensor([1.0, 0.5, 0.0], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("config", [REFERENCE, FAST])
+def test_the_nearer_gaussian_hides_the_other(config: SplattingConfig) -> None:
+    front = one_gaussian((0.7, 0.0, 0.0), (1.0, 0.0, 0.0), 0.8)
+    rear = one_gaussian((-0.7, 0.0, 0.0), (0.0, 0.0, 1.0), 0.8)
+    for azimuth, channel in ((0.0, 0), (180.0, 2)):  # from the front, from behind
+        for cloud in (join(front, rear), join(rear, front)):
+            found = picture(cloud, car_box(azimuth_deg=azimuth, elevation_deg=0.0), camera(9), config).rgb.reshape(
+                9, 9, 3
+            )[4, 4]
+            assert float(found[channel]) > 0.9
+            assert float(found[2 - channel]) < 0.1
+
+
+@pytest.mark.parametrize("config", [REFERENCE, FAST])
+def test_cars_hide_each_other_by_metric_distance(config: SplattingConfig) -> None:
+    """Two cars of one cloud each, one behind the other; merged in either order the nearer is seen."""
+    near, far = car_box(distance_m=8.0), car_box(distance_m=16.0)
+    rays = image_rays(camera(16))
+    red, blue = (replace(surface_cloud(200), rgb=torch.zeros(1, 200, 3, dtype=torch.float64)) for _ in range(2))
+    red.rgb[..., 0], blue.rgb[..., 2] = 1.0, 1.0
+    a = trace_cloud(red, rays, to_canonical(rays, near), config)
+    b = trace_cloud(blue, rays, to_canonical(rays, far), config)
+    for merged in (merge_segments(a, b), merge_segments(b, a)):
+        assert bool((merged.distance_m.diff(dim=-1) >= 0).all())
+        found = composite(merged)
+        covered = composite(a).opacity > 0.99
+        assert bool(covered.any())
+        assert float(found.rgb[covered][:, 2].max()) < 0.02
+
+
+@pytest.mark.parametrize("config", [REFERENCE, FAST])
+def test_a_mirrored_scene_gives_the_flipped_picture(config: SplattingConfig) -> None:
+    box, view = tilted_box(distance_m=6.0), Camera(torch.tensor([60.0, 55.0, 21.0, 14.0], dtype=torch.float64), 40, 30)
+    straight = picture(random_cloud(), box, view, config).rgb.reshape(30, 40, 3)
+    mirrored = picture(random_cloud().mirrored(), mirror_box(box), view.flip(), config).rgb.reshape(30, 40, 3)
+    assert float(straight.max()) > 0.2
+    assert torch.allclose(mirrored, straight.flip(1), atol=1e-9)
+
+
+def test_mirroring_negates_z_of_the_covariance() -> None:
+    cloud = random_cloud(20)
+    n = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
+    assert torch.allclose(cloud.mirrored().covariance(), n @ cloud.covariance() @ n, atol=1e-12)
+    assert torch.allclose(
+        torch.linalg.det(rotation_from_quaternion(cloud.mirrored().quaternion)), torch.ones(20).double()
+    )
+
+
+def test_widened_gaussians_look_like_the_mean_over_the_pixel() -> None:
+    """A 12-pixel picture of thin discs against the mean of a 25 times finer one, with and without widening."""
+    cloud, box = surface_cloud(2000), car_box(distance_m=20.0)
+    coarse, fine = camera(12), camera(12).resize(300, 300)
+    truth = picture(cloud, box, fine, replace(FAST, widen=False)).rgb.reshape(12, 25, 12, 25, 3).mean(dim=(1, 3))
+    errors = [
+        float((picture(cloud, box, coarse, replace(FAST, widen=widen)).rgb.reshape(12, 12, 3) - truth).abs().mean())
+        for widen in (False, True)
+    ]
+    assert errors[1] < 0.75 * errors[0], errors
+
+
+def test_a_needle_seen_from_afar_keeps_its_share_of_the_light() -> None:
+    """Widening keeps the light of a small Gaussian: opacity times its area across the line of sight."""
+    cloud = one_gaussian((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 0.02)
+    eye = torch.tensor([[9.0, 1.0, 2.0]], dtype=torch.float64)
+    wide = widened_splats(cloud, eye, torch.full((1, 1, 3), 0.04, dtype=torch.float64))
+    # round Gaussians: the area across grows with the variance, 0.0004 to 0.0404
+    assert float(wide.opacity) == pytest.approx(0.999 * 0.0004 / 0.0404, rel=1e-9)
+    assert torch.allclose(wide.precision[0, 0], torch.eye(3, dtype=torch.float64) / 0.0404)
+
+
+def test_rays_that_miss_the_box_meet_nothing() -> None:
+    cloud, box = random_cloud(), car_box()
+    rays = image_rays(camera(24))
+    canonical = to_canonical(rays, box)
+    assert not bool(canonical.hit.all())
+    for config in (FAST, REFERENCE):
+        assert float(trace_cloud(cloud, rays, canonical, config).alpha[~canonical.hit].abs().max()) == 0.0
+
+
+def test_a_gaussian_behind_the_camera_is_not_seen() -> None:
+    """The camera stands in the middle of the box and looks along x."""
+    rotation = torch.tensor([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
+    box = Box3D(torch.zeros(1, 3, dtype=torch.float64), torch.tensor([[4.0, 1.5, 1.8]]).double(), rotation[None])
+    for x, seen in ((0.5, True), (-0.5, False)):
+        for config in (FAST, REFERENCE):
+            found = picture(
+                one_gaussian((x, 0.0, 0.0), (1.0, 1.0, 1.0), 0.1), box, camera(3), replace(config, widen=False)
+            )
+            assert (float(found.opacity[0, 4]) > 0.9) is seen
