@@ -7,11 +7,12 @@ from pathlib import Path
 from carstudio.commands.command import Outcome, Output
 from carstudio.demo import DemoConfig, run_demo
 from carstudio.errors import InputError
+from carstudio.recipes import recipe
 
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(Output):
-    """Photograph synthetic cars, train car-nerf-small, show cars it never saw from all around, write a report."""
+    """Photograph synthetic cars, train a model, show cars it never saw from all around, write a report."""
 
     out: Path = Path("out/demo")
     """Folder of everything the demo makes; index.html in it is the report. Started again, it goes on."""
@@ -19,8 +20,10 @@ class Demo(Output):
     """Synthetic cars; every tenth is kept for testing."""
     views: int = 12
     """Photographs of each."""
-    minutes: float = 6.0
+    minutes: float = 5.0
     """Training time."""
+    model: str = "car-gaussians"
+    """Recipe of the model: car-gaussians, car-nerf-small, ..."""
     seed: int = 0
     """Start of all randomness."""
     device: str = "auto"
@@ -34,9 +37,16 @@ class Demo(Output):
         """Run the path; what an earlier call finished is not done again."""
         if self.cars < 4 or self.views < 2:
             raise InputError(f"--cars must be at least 4 and --views at least 2, found {self.cars} and {self.views}")
+        recipe(self.model)  # says which there are
         started = time.monotonic()
         config = DemoConfig(
-            out=self.out, cars=self.cars, views=self.views, minutes=self.minutes, seed=self.seed, device=self.device
+            out=self.out,
+            cars=self.cars,
+            views=self.views,
+            minutes=self.minutes,
+            model=self.model,
+            seed=self.seed,
+            device=self.device,
         )
         with self.progress() as report:
             result = run_demo(config, report)

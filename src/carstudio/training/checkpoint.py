@@ -14,6 +14,7 @@ from carstudio.files import read_json, sha256_file, write_json
 from carstudio.models.interface import CategoryModel
 from carstudio.models.zoo import ModelConfig, build_model, config_from_json, config_to_json
 from carstudio.tensors import load_tensors, save_tensors
+from carstudio.training.bundled import bundled_models, find_model
 
 FORMAT_VERSION = 1
 WEIGHTS, DESCRIPTION = "model.safetensors", "model.json"
@@ -55,11 +56,14 @@ def save_model(folder: Path, model: CategoryModel, config: ModelConfig, provenan
 
 
 def describe_model(folder: Path | str) -> ModelDescription:
-    """Read and check `model.json` of a run or model folder."""
-    folder = Path(folder)
+    """Read and check `model.json` of a run or model folder, or of a bundled model."""
+    folder = find_model(folder)
     path = folder / DESCRIPTION
     if not path.exists():
-        raise InputError(f"{folder}: expected a trained model ({DESCRIPTION} and {WEIGHTS}), found none; see `train`")
+        raise InputError(
+            f"{folder}: expected a trained model ({DESCRIPTION} and {WEIGHTS}), found none; see `train`, or take a "
+            f"bundled one: {', '.join(bundled_models()) or 'there is none here'}"
+        )
     value = read_json(path)
     if not isinstance(value, dict) or value.get("format_version") != FORMAT_VERSION:
         found = value.get("format_version") if isinstance(value, dict) else value
@@ -74,8 +78,8 @@ def describe_model(folder: Path | str) -> ModelDescription:
 
 
 def load_model(path_or_name: Path | str, *, device: torch.device | str = "cpu") -> CategoryModel:
-    """The model of a run folder, ready to encode, trace and render (evaluation mode)."""
-    folder = Path(path_or_name)
+    """The model of a run folder, or a bundled one by its name, ready to encode, trace and render (evaluation mode)."""
+    folder = find_model(path_or_name)
     description = describe_model(folder)
     tensors = _described_tensors(folder, description)
     _check_before_building(description.config, tensors, folder)
@@ -116,6 +120,7 @@ def _sizes_beyond(value: Any, name: str) -> list[str]:
 
 def load_weights_of(folder: Path, model: CategoryModel, config: ModelConfig) -> str:
     """Give `model` the weights of another run of the same model config; says in words what it now starts from."""
+    folder = find_model(folder)
     description = describe_model(folder)
     if description.config != config:
         theirs, ours = config_to_json(description.config), config_to_json(config)
