@@ -20,6 +20,8 @@ from carstudio.errors import InputError
 from carstudio.images import decode_image, encode_png
 from carstudio.perception.coco import read_results
 from carstudio.perception.rle import encode_rle
+from carstudio.synthetic.cars import draw_car
+from carstudio.synthetic.photographs import draw_photographs
 from dataset.made_up_kitti import P2, car_line, made_up_kitti
 from perception.tiny_hub import photograph, save_dfine, save_sam, save_sam2
 
@@ -355,3 +357,54 @@ def test_pretrained_networks_from_folders(tmp_path: Path, kind: str) -> None:
     assert all(record.score_2d is not None and record.score_mask is not None for record in records)
     shares = [record.mask_ratio for record in records if record.mask_ratio is not None]
     assert 0.01 < float(np.mean(shares)) < 0.99
+
+
+def test_dvm_cars_made_of_synthetic_cars(tmp_path: Path) -> None:
+    """Photographs of parametric cars in DVM's layout, with true boxes, masks and cameras: each stays at its true place;
+    none stays where the table tells another side of it."""
+    root, boxes3d, calibration = tmp_path / "dvm", tmp_path / "boxes", tmp_path / "calib"
+    folder = root / "resized_DVM" / "Make" / "Model" / "2017" / "Blue"
+    for path in (folder, boxes3d, calibration):
+        path.mkdir(parents=True)
+    content, rows, truth = [], [], {}
+    for number in range(4):
+        car = draw_car(np.random.default_rng([5, number]))
+        (photo,) = draw_photographs(car, seed=(5, number), num_views=1, size_px=300, cameras="kitti")
+        name = f"Make$$Model$$2017$$Blue$$1_1$${number}$$image_0.jpg"
+        Image.fromarray(photo.image).save(folder / name, quality=95)
+        fx, fy, cx, cy = photo.viewpoint.camera.intrinsics.tolist()
+        frame = f"1_1-{number}-0"
+        (calibration / f"{frame}.txt").write_text(f"P2: {fx} 0 {cx} 0 0 {fy} {cy} 0 0 0 1 0")
+        box = photo.viewpoint.box(car.mesh)
+        center, (length, height, width), yaw = box.center.tolist(), box.size.tolist(), float(box.yaw_rad)
+        v, u = np.nonzero(photo.mask)
+        x0, y0, x1, y1 = int(u.min()), int(v.min()), int(u.max()) + 1, int(v.max()) + 1
+        place = f"{center[0]} {center[1] + height / 2} {center[2]} {yaw}"
+        (boxes3d / f"{frame}.txt").write_text(f"Car -1 -1 0 {x0} {y0} {x1} {y1} {height} {width} {length} {place} 0.9")
+        result = {"image_id": frame, "category_id": 3, "bbox": [x0, y0, x1 - x0, y1 - y0], "score": 0.9}
+        content.append(result | {"segmentation": encode_rle(photo.mask)})
+        rows.append((name, 450.0 - math.degrees(yaw)))
+        truth[frame] = box
+    file = results(tmp_path / "r.json", {})
+    file.write_text(json.dumps(content))
+    for out, offset, reasons in (("s", 0.0, {"kept"}), ("t", 90.0, {"viewpoint_deg"})):
+        with (root / "Image_table.csv").open("w", newline="") as table:
+            csv.writer(table).writerows([(" Image_name", " Predicted_viewpoint"), *((n, d + offset) for n, d in rows)])
+        store = build_photos(
+            root,
+            tmp_path / out,
+            source="dvm-cars",
+            filters=FilterRecipe(),
+            detector=f"precomputed:{file}",
+            segmenter=f"precomputed:{file}",
+            box3d=f"precomputed:{boxes3d}",
+            camera=f"calib:{calibration}",
+        )
+        found = {verdict.reason for verdict in store.verdicts()} - {"centred", "height_px", "mask_ratio"}
+        assert found == reasons
+    assert store.info()["kept"] == 0
+    for record in open_store(tmp_path / "s").records():
+        box = truth[record.frame_id]
+        assert record.box_center == pytest.approx(box.center.tolist(), abs=1e-5)
+        assert record.box_iou is not None
+        assert record.box_iou > 0.8  # a car's silhouette does not fill the envelope of its box

@@ -1,6 +1,7 @@
 import pytest
 import torch
 
+from carstudio.errors import InputError
 from carstudio.geometry.box3d import Box3D
 from carstudio.geometry.camera import Camera
 from carstudio.geometry.orbit import orbit_box, orbit_camera
@@ -177,3 +178,17 @@ def test_the_small_recipe_builds_and_renders() -> None:
     assert bool(torch.isfinite(image["rgb"]).all())
     assert 0.0 <= float(image["rgb"].min())
     assert float(image["rgb"].max()) <= 1.0 + 1e-5
+
+
+def test_weights_too_large_for_any_picture_are_told() -> None:
+    """Finite weights can still overflow on their way to a pixel."""
+    torch.manual_seed(0)
+    model = small_model()
+    with torch.no_grad():
+        for parameter in model.field.parameters():
+            parameter.mul_(1e30)
+    box = orbit_box(torch.tensor([4.0, 1.5, 1.8]), azimuth_deg=40.0, elevation_deg=10.0, distance_m=9.0)
+    batch = Box3D(box.center[None], box.size[None], box.rotation[None])
+    latents = Latents(torch.ones(1, 16), torch.ones(1, 16))
+    with pytest.raises(InputError, match="not made of finite numbers: its weights are damaged"):
+        render_image(model, orbit_camera(4), latents, batch)

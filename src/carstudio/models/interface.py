@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from carstudio.errors import InputError
 from carstudio.geometry.box3d import Box3D
 from carstudio.geometry.camera import Camera
 from carstudio.rendering.rays import Rays, image_rays, to_canonical
@@ -92,6 +93,7 @@ def render_image(
     """rgb, opacity and depth_m images of one car (batches of one) through one camera, `chunk` rays at a time.
 
     Only rays that hit the box are traced; the others are black, transparent, of depth 0. The chunk changes no pixel.
+    `InputError` when the weights, though finite themselves, give numbers that are not.
     """
     rays = image_rays(camera)
     hit = to_canonical(rays, box).hit[0].nonzero().squeeze(-1)
@@ -101,5 +103,10 @@ def render_image(
     for rows in hit.split(chunk):
         part = model.render(rays.select(rows), latents, box)
         rgb[rows], opacity[rows], depth[rows] = part.rgb[0], part.opacity[0], part.depth_m[0]
+    if not all(bool(values.isfinite().all()) for values in (rgb, opacity, depth)):
+        raise InputError(
+            "the model's picture is not made of finite numbers: its weights are damaged, or its training ran away; use "
+            "another run"
+        )
     shape = (camera.height, camera.width)
     return {"rgb": rgb.reshape(*shape, 3), "opacity": opacity.reshape(shape), "depth_m": depth.reshape(shape)}
