@@ -4,6 +4,7 @@ Exit code 1 when one did not; what it was is kept, made small, in a folder.
 """
 
 import argparse
+import os
 import re
 import sys
 import tempfile
@@ -24,6 +25,8 @@ with install_import_hook("carstudio", "beartype.beartype"):  # a value of anothe
 def main(arguments: list[str]) -> int:
     """Fuzz or replay."""
     options = parse(arguments)
+    if options.engine == "atheris":
+        run_guided(options.target, inputs=options.inputs, seed=options.seed, out=options.out)
     torch.set_num_threads(1)
     if options.replay:
         return replay(options.target, options.replay)
@@ -51,6 +54,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(prog="./run fuzz", description=__doc__)
     parser.add_argument("--target", choices=[*TARGETS, "all"], default="all")
+    parser.add_argument("--engine", choices=["edits", "atheris"], default="edits", help="atheris: led by coverage")
     parser.add_argument("--inputs", type=int, default=1000, help="per target (1000)")
     parser.add_argument("--seed", type=int, default=0, help="chooses every input (0)")
     parser.add_argument("--jobs", type=int, default=2, help="processes (2)")
@@ -59,9 +63,16 @@ def parse(arguments: list[str]) -> argparse.Namespace:
     options = parser.parse_args(arguments)
     if options.inputs < 1 or options.jobs < 1:
         parser.error("--inputs and --jobs must be at least 1")
-    if options.replay and options.target == "all":
-        parser.error("--replay needs --target")
+    if (options.replay or options.engine == "atheris") and options.target == "all":
+        parser.error("--replay and --engine atheris need --target")
     return options
+
+
+def run_guided(name: str, *, inputs: int, seed: int, out: str | None) -> None:
+    """Become the other program: it must mark the branches of the readers while it imports them."""
+    folder = out or tempfile.mkdtemp(prefix="carstudio-fuzz-finds-")
+    options = ["--target", name, "--inputs", str(inputs), "--seed", str(seed), "--out", folder]
+    os.execv(sys.executable, [sys.executable, "-m", "fuzz.guided", *options])
 
 
 def describe(tally: Tally) -> str:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from carstudio.errors import InputError
 from fuzz.campaign import attempt, run_campaign
 from fuzz.edits import KINDS, Edit, Files, apply, draw_edits
+from fuzz.guided import unpack, write_corpus
 from fuzz.minimise import minimise
 from fuzz.target import Target, is_refused, make_input
 from fuzz.targets import TARGETS
@@ -109,3 +110,19 @@ def test_edits_do_what_they_say_and_take_any_numbers() -> None:
     rng = random.Random(0)
     for _ in range(300):
         assert apply(draw_edits(rng), files, {}).keys() == files.keys()
+
+
+@pytest.mark.parametrize("name", ["labels", "frame", "store"])
+def test_guided_inputs_are_files_again(name: str, tmp_path: Path) -> None:
+    """Each corpus entry gives its seed back; any bytes are some input."""
+    target = TARGETS[name]
+    seeds = list(target.seeds())
+    write_corpus(target, seeds, tmp_path)
+    entries = sorted(tmp_path.iterdir())
+    assert len(entries) == 2 * sum(len(files) for files in seeds)
+    for entry in entries:
+        index, _, mend = (int(part) for part in entry.name.split("-")[1:])
+        expected = target.mend(dict(seeds[index])) if mend else seeds[index]
+        assert unpack(target, seeds, entry.read_bytes()) == expected
+    for data in (b"", b"\xff", bytes(range(7))):
+        assert unpack(target, seeds, data).keys() >= {sorted(seeds[(data + b"\0")[0] % 128 % len(seeds)])[0]}

@@ -19,6 +19,7 @@ from carstudio.errors import InputError
 
 EXTRAS = {
     "onnx": "detectors and segmenters in ONNX files (--detector onnx:FILE, --segmenter onnx:FILE)",
+    "fuzz": "coverage-guided fuzzing of the readers, for developers (./run fuzz --engine atheris)",
     "photo": "path-traced synthetic photographs (synth --renderer mitsuba)",
     "track": "training curves in TensorBoard",
     "lpips": "the LPIPS figure of evaluate",
