@@ -17,6 +17,7 @@ from carstudio.models.interface import CategoryModel, Latents, PatchBatch
 from carstudio.models.patch_features import POSE_FEATURES, pose_features, tiny_masked_copy
 from carstudio.models.photo_features import PHOTO_FEATURES, photo_at
 from carstudio.rendering.gaussians.cloud import GaussianCloud
+from carstudio.rendering.gaussians.tiles import TILE_PX
 from carstudio.rendering.gaussians.tracing import SplattingConfig, render_cloud, trace_cloud
 from carstudio.rendering.rays import Rays, to_canonical
 from carstudio.rendering.volume import Rendering, Segments
@@ -56,6 +57,8 @@ class CarGaussiansConfig:
 
 class CarGaussians(CategoryModel):
     """Encoder, two codes, two decoders."""
+
+    tile_px = TILE_PX
 
     def __init__(self, config: CarGaussiansConfig) -> None:
         super().__init__()

@@ -6,7 +6,7 @@ Fitting, editing, evaluation, export and the viewer know only this. One car per 
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from carstudio.geometry.box3d import Box3D
@@ -52,6 +52,8 @@ class CategoryModel(nn.Module):
     """Base of all models. Subclasses give `encode` and `trace_levels`, and the side of the images they encode."""
 
     encoder_side_px: int
+    tile_px: int = 1
+    """Side of the square of neighbouring pixels whose rays the model likes to get together when an image is drawn."""
 
     def load_pretrained_parts(self) -> str:
         """Load what a config asks to start from (an ImageNet encoder); says in words what the encoder starts from."""
@@ -74,7 +76,9 @@ class CategoryModel(nn.Module):
         self, rays: Rays, latents: Latents, box: Box3D, generator: torch.Generator | None = None
     ) -> tuple[Rendering, ...]:
         """Composited segments of each level, what training compares; a model may have a shorter way to them."""
-        return tuple(composite(segments) for segments in self.trace_levels(rays, latents, box, generator))
+        levels = self.trace_levels(rays, latents, box, generator)
+        with torch.autocast(rays.directions.device.type, enabled=False):
+            return tuple(composite(segments) for segments in levels)
 
     def trace(self, rays: Rays, latents: Latents, box: Box3D) -> Segments:
         """Segments in metres, ordered along each ray; several cars and a background merge through them."""
@@ -91,10 +95,11 @@ def render_image(
 ) -> dict[str, Float[Tensor, "height width *channel"]]:
     """rgb, opacity and depth_m images of one car (batches of one) through one camera, `chunk` rays at a time.
 
-    Only rays that hit the box are traced; the others are black, transparent, of depth 0. The chunk changes no pixel.
+    Only rays that hit the box (or whose tile has one that does) are traced; the others are black, transparent, of depth
+    0. The chunk changes no pixel.
     """
     rays = image_rays(camera)
-    hit = to_canonical(rays, box).hit[0].nonzero().squeeze(-1)
+    hit = _tiles_that_hit(to_canonical(rays, box).hit.view(camera.height, camera.width), model.tile_px)
     count = camera.width * camera.height
     rgb = rays.directions.new_zeros(count, 3)
     opacity, depth = rays.directions.new_zeros(count), rays.directions.new_zeros(count)
@@ -103,3 +108,15 @@ def render_image(
         rgb[rows], opacity[rows], depth[rows] = part.rgb[0], part.opacity[0], part.depth_m[0]
     shape = (camera.height, camera.width)
     return {"rgb": rgb.reshape(*shape, 3), "opacity": opacity.reshape(shape), "depth_m": depth.reshape(shape)}
+
+
+def _tiles_that_hit(hit: Bool[Tensor, "height width"], side: int) -> Int[Tensor, " pixel"]:
+    """Pixel numbers of all side x side tiles with a hit, tile by tile; tiles at the edge repeat their pixels."""
+    height, width = hit.shape
+    padded = torch.nn.functional.pad(hit, (0, -width % side, 0, -height % side))
+    touched = padded.unflatten(0, (-1, side)).unflatten(2, (-1, side)).any(dim=3).any(dim=1)
+    row, column = touched.nonzero().unbind(-1)
+    inside = torch.arange(side, device=hit.device)
+    rows = (row[:, None] * side + inside).clamp(max=height - 1)
+    columns = (column[:, None] * side + inside).clamp(max=width - 1)
+    return (rows[:, :, None] * width + columns[:, None]).flatten()
