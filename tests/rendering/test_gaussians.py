@@ -12,7 +12,8 @@ from carstudio.geometry.canonical import canonical_from_camera
 from carstudio.geometry.orbit import orbit_box, orbit_camera
 from carstudio.geometry.transforms import rotation_from_quaternion
 from carstudio.models.gaussian_template import surface_template
-from carstudio.rendering.gaussians import hits
+from carstudio.models.interface import _tiles_that_hit
+from carstudio.rendering.gaussians import hits, tiles
 from carstudio.rendering.gaussians.cloud import GaussianCloud, Splats, invert_symmetric, splats_of, widened_splats
 from carstudio.rendering.gaussians.reference import MAX_ALPHA, responses, sorted_responses
 from carstudio.rendering.gaussians.tracing import SplattingConfig, render_cloud, trace_cloud
@@ -317,3 +318,53 @@ def test_a_gaussian_behind_the_camera_is_not_seen() -> None:
                 one_gaussian((x, 0.0, 0.0), (1.0, 1.0, 1.0), 0.1), box, camera(3), replace(config, widen=False)
             )
             assert (float(found.opacity[0, 4]) > 0.9) is seen
+
+
+def tile_rays(side: int, dtype: torch.dtype = torch.float64) -> Rays:
+    """Rays of an image in the order of 4 x 4 tiles."""
+    pixels = _tiles_that_hit(torch.ones(side, side, dtype=torch.bool), tiles.TILE_PX)
+    return image_rays(camera(side, dtype)).select(pixels)
+
+
+@pytest.mark.parametrize("make", [random_cloud, surface_cloud])
+def test_tiles_leave_out_nothing_that_is_met(make, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By tiles and ray by ray: the same alphas, distances and gradients."""
+    rays, results = tile_rays(48), []
+    canonical = to_canonical(rays, car_box())
+    for coherent in (0.7, 0.0):
+        monkeypatch.setattr(tiles, "COHERENT", coherent)
+        parts = leaves(make())
+        found = trace_cloud(GaussianCloud(*parts), rays, canonical, SplattingConfig(most=400))
+        width = found.alpha.shape[-1]
+        loss = (composite(found).rgb * torch.linspace(0, 1, 3)).sum()
+        results.append((found, width, torch.autograd.grad(loss, parts)))
+    (tiled, few, tiled_gradients), (whole, many, whole_gradients) = results
+    assert few < many, "tiles left nothing out"
+    assert torch.allclose(tiled.alpha, whole.alpha[..., :few], atol=1e-12)
+    assert float(whole.alpha[..., few:].max()) == 0.0
+    lit = tiled.alpha > 0
+    assert torch.allclose(tiled.distance_m[lit], whole.distance_m[..., :few][lit], atol=1e-12)
+    for a, b in zip(tiled_gradients, whole_gradients, strict=True):
+        assert torch.allclose(a, b, atol=1e-9)
+
+
+def test_scattered_rays_are_no_tiles() -> None:
+    rays = image_rays(camera(32))
+    order = torch.randperm(1024, generator=torch.Generator().manual_seed(0))
+    canonical, splats = to_canonical(rays.select(order), car_box()), splats_of(surface_cloud())
+    points = torch.zeros_like(canonical.origins)
+    met = tiles.encounter(splats, surface_cloud().rgb, points, canonical.view_directions, canonical.near)
+    assert met.opacity.shape == (1, 400)
+    assert met.features.shape == (1, 1024, 25)
+
+
+@pytest.mark.parametrize(("height", "width"), [(8, 8), (7, 10), (1, 1), (4, 13)])
+@pytest.mark.parametrize("side", [1, 4])
+def test_touched_tiles_cover_all_hits_tile_by_tile(height: int, width: int, side: int) -> None:
+    hit = torch.rand(height, width, generator=torch.Generator().manual_seed(height)) < 0.3
+    pixels = _tiles_that_hit(hit, side).unflatten(0, (-1, side * side))
+    assert set(hit.flatten().nonzero().flatten().tolist()) <= set(pixels.flatten().tolist())
+    for tile in pixels.tolist():
+        places = {(pixel // width // side, pixel % width // side) for pixel in tile}
+        assert len(places) == 1
+        assert any(bool(hit.flatten()[pixel]) for pixel in tile)

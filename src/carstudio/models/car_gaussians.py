@@ -47,8 +47,10 @@ class CarGaussiansConfig:
     """Side of a tiny copy of the masked crop, added to the texture code by a linear map; 0: none."""
     sees_photo: bool = True
     """Look up each Gaussian's place (and its mirror image's) in the photo; the findings lengthen the texture code."""
-    embedding: int = 16
-    """Length of what the colour decoder knows about each Gaussian."""
+    kin_size: int = 16
+    """Length of the embeddings whose products say how much one Gaussian's colour tells about another's."""
+    kin_heads: int = 2
+    """Kinds of such kinship."""
     least_scale: float = 0.01
     """Smallest standard deviation of a Gaussian, canonical units."""
     largest_scale: float = 0.5
@@ -88,7 +90,8 @@ class CarGaussians(CategoryModel):
         if self.config.sees_photo:
             with torch.no_grad(), torch.autocast(patches.image.device.type, enabled=False):
                 mean = self.geometry(shape.to(patches.image.dtype))[0]
-                texture = torch.cat([texture, photo_at(mean, patches).flatten(1).to(texture.dtype)], dim=-1)
+                photo = photo_at(mean, patches).flatten(1).to(texture.dtype)
+            texture = torch.cat([texture, photo], dim=-1)
         return Latents(shape, texture)
 
     def decode(self, latents: Latents) -> GaussianCloud:
@@ -168,8 +171,8 @@ class GeometryDecoder(nn.Module):
 class ColourDecoder(nn.Module):
     """Texture code (and the detached shape code) to a colour per Gaussian.
 
-    Where the photo was looked up, the colour is a mix of what the code says, what the photo shows at the Gaussian and
-    what it shows at the Gaussian's mirror image.
+    Where the photo was looked up, what it shows differently from what the code says spreads from seen Gaussians to
+    related ones (`ResidualSpread`).
     """
 
     def __init__(self, config: CarGaussiansConfig) -> None:
@@ -178,28 +181,41 @@ class ColourDecoder(nn.Module):
         self.hidden = nn.Sequential(nn.Linear(2 * config.code_size, config.width), nn.SiLU())
         self.colours = nn.Linear(config.width, config.num_splats * 3)
         if config.sees_photo:
-            self.embedding = nn.Parameter(torch.randn(config.num_splats, config.embedding))
-            self.context = nn.Linear(config.width, config.embedding)
-            self.mix = nn.Sequential(
-                nn.Linear(2 * PHOTO_FEATURES + 2 * config.embedding, 64), nn.SiLU(), nn.Linear(64, 6)
-            )
+            self.spread = ResidualSpread(config)
 
     def forward(self, latents: Latents) -> Float[Tensor, "batch splat 3"]:
-        """Rgb in [0, 1]."""
+        """Colours in [0, 1]."""
         code = latents.texture[:, : self.config.code_size]
         hidden = self.hidden(torch.cat([code, latents.shape.detach()], dim=-1))
-        colours = self.colours(hidden).unflatten(-1, (-1, 3))
+        colours = torch.sigmoid(self.colours(hidden).unflatten(-1, (-1, 3)))
         if not self.config.sees_photo:
-            return torch.sigmoid(colours)
+            return colours
         photo = latents.texture[:, self.config.code_size :].unflatten(-1, (-1, PHOTO_FEATURES))
-        other = photo.roll(self.config.num_splats // 2, dims=1)
-        context = self.context(hidden)[:, None].expand(-1, self.config.num_splats, -1)
-        known = torch.cat([photo, other, context, self.embedding.expand(len(code), -1, -1)], dim=-1)
-        mixed = self.mix(known)
-        own = torch.sigmoid(colours + mixed[..., :3])
-        share = mixed[..., 3:].softmax(dim=-1) * torch.stack(
-            [torch.ones_like(photo[..., 3]), photo[..., 3], other[..., 3]], dim=-1
-        )
-        share = share / share.sum(dim=-1, keepdim=True)
-        seen, mirrored = (found[..., :3] / found[..., 3:].clamp(min=1e-3) for found in (photo, other))
-        return share[..., :1] * own + share[..., 1:2] * seen + share[..., 2:] * mirrored
+        return (colours + self.spread(colours, photo)).clamp(0, 1)
+
+
+class ResidualSpread(nn.Module):
+    """How a surprise at one Gaussian tells on the others: learned kinship, the same for all cars.
+
+    r_h = photo - colour where Gaussian h is seen (visibility v_h); Gaussian g is corrected by the mean of r_h over its
+    kin, sum_h a_gh v_h r_h / (sum_h a_gh v_h + few), a = softmax(q k^T): paint learns from paint, wheels from wheels.
+    """
+
+    def __init__(self, config: CarGaussiansConfig) -> None:
+        super().__init__()
+        count, heads, size = config.num_splats, config.kin_heads, config.kin_size
+        self.query = nn.Parameter(torch.randn(heads, count, size) * 0.5)
+        self.key = nn.Parameter(torch.randn(heads, count, size) * 0.5)
+        self.trust = nn.Parameter(torch.full((heads, count, 1), 0.0))
+        self.few = 0.02
+
+    def forward(
+        self, colours: Float[Tensor, "batch splat 3"], photo: Float[Tensor, "batch splat 4"]
+    ) -> Float[Tensor, "batch splat 3"]:
+        """What to add to the colours."""
+        seen = photo[..., 3:]
+        values = torch.cat([photo[..., :3] - seen * colours, seen], dim=-1)
+        kinship = torch.softmax(self.query @ self.key.mT, dim=-1)
+        gathered = kinship @ values[:, None]
+        mean = gathered[..., :3] / (gathered[..., 3:] + self.few)
+        return (torch.sigmoid(self.trust) * mean).sum(dim=1)

@@ -32,7 +32,7 @@ def trace_cloud(cloud: GaussianCloud, rays: Rays, canonical: CanonicalRays, conf
 
     All metric: the peak's distance along the ray, its depth, its alpha; rgb is the Gaussian's.
     """
-    hits = _hits(cloud, canonical, config)
+    hits = _hits(cloud, rays, canonical, config)
     shape = (*canonical.hit.shape, hits.alpha.shape[-1])
     distance = (hits.t.reshape(shape) + hits.middle[..., None]) / canonical.stretch[..., None]
     groups = torch.arange(len(hits.index), device=hits.index.device)[:, None, None]
@@ -44,7 +44,7 @@ def trace_cloud(cloud: GaussianCloud, rays: Rays, canonical: CanonicalRays, conf
 
 def render_cloud(cloud: GaussianCloud, rays: Rays, canonical: CanonicalRays, config: SplattingConfig) -> Rendering:
     """What `composite` makes of `trace_cloud`'s segments, without laying out the segments' colours."""
-    hits = _hits(cloud, canonical, config)
+    hits = _hits(cloud, rays, canonical, config)
     rgb, sums, weights = composite_hits(hits.alpha, hits.t, hits.index, hits.rgb)
     shape, hit = canonical.hit.shape, canonical.hit[..., None]
     rgb, sums, weights = rgb.reshape(*shape, 3) * hit, sums.reshape(*shape, 2) * hit, weights.reshape(*shape, -1) * hit
@@ -64,8 +64,8 @@ class _Hits:
     middle: Float[Tensor, "batch all_rays"]
 
 
-def _hits(cloud: GaussianCloud, canonical: CanonicalRays, config: SplattingConfig) -> _Hits:
-    splats = splats_seen(cloud, canonical) if config.widen else splats_of(cloud)
+def _hits(cloud: GaussianCloud, rays: Rays, canonical: CanonicalRays, config: SplattingConfig) -> _Hits:
+    splats = splats_seen(cloud, rays, canonical) if config.widen else splats_of(cloud)
     directions = canonical.view_directions
     middle = -(canonical.origins * directions).sum(dim=-1)
     points = canonical.origins + middle[..., None] * directions
@@ -76,16 +76,16 @@ def _hits(cloud: GaussianCloud, canonical: CanonicalRays, config: SplattingConfi
     return _Hits(alpha, t, index, met.rgb, middle)
 
 
-def splats_seen(cloud: GaussianCloud, canonical: CanonicalRays) -> Splats:
+def splats_seen(cloud: GaussianCloud, rays: Rays, canonical: CanonicalRays) -> Splats:
     """Splats as wide as the rays' cones at them make them.
 
-    One camera per batch entry is assumed here: the mean of the rays' origins and radii stands for all.
+    A pixel's cone has a radius proportional to depth (camera z), the same for all pixels of a pinhole camera; where the
+    cameras of a batch entry differ, the mean stands for all.
     """
     eye = canonical.origins.mean(dim=1)
-    metric = (cloud.mean - eye[:, None]) @ torch.linalg.inv(canonical.linear).mT
-    radius = canonical.radii.mean(dim=1)[:, None] * metric.norm(dim=-1)
-    footprint = footprint_variance(radius, canonical.linear)
-    return widened_splats(cloud, eye, footprint)
+    depth = ((cloud.mean - eye[:, None]) @ torch.linalg.inv(canonical.linear).mT)[..., 2]
+    radius_at_one = (rays.radii / rays.directions[..., 2].clamp(min=1e-3)).mean(dim=1)
+    return widened_splats(cloud, eye, footprint_variance(radius_at_one[:, None] * depth, canonical.linear))
 
 
 def footprint_variance(
