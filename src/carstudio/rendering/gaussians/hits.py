@@ -164,7 +164,7 @@ def _keys(features: Tensor, coefficients: Tensor, limit: Tensor, nearest: Tensor
     t = b.div(features[..., 19:] @ coefficients[:, :6])
     over.addcmul_(b, t, value=-1 / scale**2)
     last = 2 ** (29 - _bits(num_splats))
-    place = torch.add(t, over.clamp(min=0), alpha=1e9)
+    place = torch.add(t, over.clamp(min=0), alpha=1e12)
     if bool((nearest > -_REACH).any()):  # the camera is so near that Gaussians may lie behind it
         place = torch.where(t <= nearest[..., None] * scale, float(last), place)
     keys = place.clamp_(-last, last - 1).to(torch.int32).mul_(2 ** _bits(num_splats))
