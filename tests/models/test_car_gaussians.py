@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from carstudio.dataset.store import PatchStore
+from carstudio.errors import InputError
 from carstudio.evaluation.protocols import EvaluationConfig, score_views, view_pairs
 from carstudio.geometry.box3d import Box3D, mirror_box
 from carstudio.geometry.camera import Camera
@@ -16,6 +17,7 @@ from carstudio.models.encoders import EncoderConfig
 from carstudio.models.gaussian_template import EXTENT, surface_template
 from carstudio.models.interface import CategoryModel, Latents, PatchBatch, render_image
 from carstudio.models.photo_features import in_front, photo_at
+from carstudio.models.zoo import config_from_json, config_to_json
 from carstudio.recipes import RECIPES, recipe
 from carstudio.rendering.rays import image_rays
 from carstudio.rendering.volume import composite
@@ -70,7 +72,7 @@ def test_colour_errors_do_not_bend_the_shape() -> None:
 
 
 def test_every_weight_learns() -> None:
-    model, patches = small_model().train(), batch(3)
+    model, patches = small_model(is_tinted=True).train(), batch(3)
     rays = image_rays(orbit_camera(12))
     rays = dataclasses.replace(rays, **{k: v.expand(3, *v.shape[1:]) for k, v in vars(rays).items()})
     rendered = model.render_levels(rays, model.encode(patches), patches.box)[-1]
@@ -206,3 +208,11 @@ def test_the_recipes_build_and_render(name: str) -> None:
     assert 0.0 <= float(image["rgb"].min())
     assert float(image["rgb"].max()) <= 1.0 + 1e-5
     assert float(image["opacity"].max()) > 0.5
+
+
+def test_a_damaged_description_is_refused() -> None:
+    value = config_to_json(SMALL)
+    assert config_from_json(value, name="model.json") == SMALL
+    for change in ({"num_splats": 63}, {"least_scale": 0.0}, {"splatting": {"most": "many"}}, {"wings": 2}):
+        with pytest.raises(InputError, match=r"model\.json"):
+            config_from_json({**value, **change}, name="model.json")

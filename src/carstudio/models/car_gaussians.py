@@ -47,6 +47,8 @@ class CarGaussiansConfig:
     """Side of a tiny copy of the masked crop, added to the texture code by a linear map; 0: none."""
     sees_photo: bool = True
     """Look up each Gaussian's place (and its mirror image's) in the photo; the findings lengthen the texture code."""
+    is_tinted: bool = False
+    """Colours change with the line of sight (spherical harmonics of degree 1)."""
     kin_size: int = 16
     """Length of the embeddings whose products say how much one Gaussian's colour tells about another's."""
     kin_heads: int = 2
@@ -55,6 +57,10 @@ class CarGaussiansConfig:
     """Smallest standard deviation of a Gaussian, canonical units."""
     largest_scale: float = 0.5
     """Largest standard deviation, canonical units."""
+
+    def __post_init__(self) -> None:
+        assert not self.is_symmetric or self.num_splats % 2 == 0, "mirrored pairs need an even number of Gaussians"
+        assert 0 < self.least_scale < self.largest_scale, "scales are positive, the least below the largest"
 
 
 class CarGaussians(CategoryModel):
@@ -97,7 +103,8 @@ class CarGaussians(CategoryModel):
     def decode(self, latents: Latents) -> GaussianCloud:
         """The car's Gaussians in the canonical frame."""
         mean, log_scale, quaternion, opacity = self.geometry(latents.shape)
-        return GaussianCloud(mean, log_scale, quaternion, opacity, self.colour(latents))
+        rgb, tint = self.colour(latents)
+        return GaussianCloud(mean, log_scale, quaternion, opacity, rgb, tint)
 
     def trace_levels(
         self, rays: Rays, latents: Latents, box: Box3D, generator: torch.Generator | None = None
@@ -129,7 +136,6 @@ class GeometryDecoder(nn.Module):
 
     def __init__(self, config: CarGaussiansConfig) -> None:
         super().__init__()
-        assert not config.is_symmetric or config.num_splats % 2 == 0, "mirrored pairs need an even number"
         self.config = config
         count = config.num_splats // 2 if config.is_symmetric else config.num_splats
         self.hidden = nn.Sequential(nn.Linear(config.code_size, config.width), nn.SiLU())
@@ -182,16 +188,23 @@ class ColourDecoder(nn.Module):
         self.colours = nn.Linear(config.width, config.num_splats * 3)
         if config.sees_photo:
             self.spread = ResidualSpread(config)
+        if config.is_tinted:
+            self.tint = nn.Linear(config.width, config.num_splats * 9)
+            nn.init.zeros_(self.tint.weight)
+            nn.init.zeros_(self.tint.bias)
 
-    def forward(self, latents: Latents) -> Float[Tensor, "batch splat 3"]:
-        """Colours in [0, 1]."""
+    def forward(
+        self, latents: Latents
+    ) -> tuple[Float[Tensor, "batch splat 3"], Float[Tensor, "batch splat 3 3"] | None]:
+        """Colours in [0, 1], and their change with the line of sight where the config asks for one."""
         code = latents.texture[:, : self.config.code_size]
         hidden = self.hidden(torch.cat([code, latents.shape.detach()], dim=-1))
         colours = torch.sigmoid(self.colours(hidden).unflatten(-1, (-1, 3)))
+        tint = self.tint(hidden).unflatten(-1, (-1, 3, 3)) if self.config.is_tinted else None
         if not self.config.sees_photo:
-            return colours
+            return colours, tint
         photo = latents.texture[:, self.config.code_size :].unflatten(-1, (-1, PHOTO_FEATURES))
-        return (colours + self.spread(colours, photo)).clamp(0, 1)
+        return (colours + self.spread(colours, photo)).clamp(0, 1), tint
 
 
 class ResidualSpread(nn.Module):

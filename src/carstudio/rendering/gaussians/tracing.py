@@ -69,9 +69,10 @@ def _hits(cloud: GaussianCloud, rays: Rays, canonical: CanonicalRays, config: Sp
     directions = canonical.view_directions
     middle = -(canonical.origins * directions).sum(dim=-1)
     points = canonical.origins + middle[..., None] * directions
+    rgb = cloud.colour_from(canonical.origins.mean(dim=1))
     if config.is_reference:
-        return _Hits(*sorted_responses(splats, points, directions, -middle), cloud.rgb, middle)
-    met = encounter(splats, cloud.rgb, points, directions, -middle)
+        return _Hits(*sorted_responses(splats, points, directions, -middle), rgb, middle)
+    met = encounter(splats, rgb, points, directions, -middle)
     alpha, t, index = hits_of_features(met.coefficients, met.opacity, met.features, met.nearest, most=config.most)
     return _Hits(alpha, t, index, met.rgb, middle)
 
