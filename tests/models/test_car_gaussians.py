@@ -28,6 +28,7 @@ from training.toy import TINY, toy_store
 SMALL = CarGaussiansConfig(
     encoder=EncoderConfig(kind="small", side_px=32, pretrained=None, num_features=32, sees_mask=True),
     num_splats=64,
+    sees_photo=True,
     code_size=16,
     width=32,
     colour_skip_px=4,

@@ -45,7 +45,7 @@ class CarGaussiansConfig:
     """Gaussians come in pairs mirrored in the car's middle plane; colours are free."""
     colour_skip_px: int = 8
     """Side of a tiny copy of the masked crop, added to the texture code by a linear map; 0: none."""
-    sees_photo: bool = True
+    sees_photo: bool = False
     """Look up each Gaussian's place (and its mirror image's) in the photo; the findings lengthen the texture code."""
     is_tinted: bool = False
     """Colours change with the line of sight (spherical harmonics of degree 1)."""
