@@ -76,10 +76,10 @@ def car_gaussians() -> TrainConfig:
 
 
 def car_gaussians_preview() -> TrainConfig:
-    """The same with 256 Gaussians and fewer rays: a car to look at after a minute or two."""
+    """The same with 256 Gaussians: a car to look at after a minute or two."""
     config = car_gaussians()
     model = CarGaussiansConfig(num_splats=256, splatting=SplattingConfig(most=24))
-    return replace(config, recipe="car-gaussians-preview", model=model, rays_per_patch=128, steps=2_000)
+    return replace(config, recipe="car-gaussians-preview", model=model, steps=2_000)
 
 
 RECIPES: dict[str, Callable[[], TrainConfig]] = {

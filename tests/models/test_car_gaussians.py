@@ -15,11 +15,11 @@ from carstudio.geometry.orbit import orbit_box, orbit_camera
 from carstudio.models.car_gaussians import CarGaussians, CarGaussiansConfig
 from carstudio.models.encoders import EncoderConfig
 from carstudio.models.gaussian_template import EXTENT, surface_template
-from carstudio.models.interface import CategoryModel, Latents, PatchBatch, render_image
+from carstudio.models.interface import CategoryModel, Latents, PatchBatch, render_image, window_of
 from carstudio.models.photo_features import in_front, photo_at
 from carstudio.models.zoo import config_from_json, config_to_json
 from carstudio.recipes import RECIPES, recipe
-from carstudio.rendering.rays import image_rays
+from carstudio.rendering.rays import image_rays, to_canonical
 from carstudio.rendering.volume import composite
 from carstudio.training.checkpoint import load_model, save_model
 from carstudio.training.trainer import train
@@ -217,3 +217,31 @@ def test_a_damaged_description_is_refused() -> None:
     for change in ({"num_splats": 63}, {"least_scale": 0.0}, {"splatting": {"most": "many"}}, {"wings": 2}):
         with pytest.raises(InputError, match=r"model\.json"):
             config_from_json({**value, **change}, name="model.json")
+
+
+@pytest.mark.parametrize("azimuth_deg", [0.0, 33.0, 90.0])
+@pytest.mark.parametrize("distance_m", [1.0, 5.0, 30.0])
+@pytest.mark.parametrize("shift_px", [-90.0, 0.0, 25.0])
+def test_no_ray_outside_of_the_window_hits_the_box(azimuth_deg: float, distance_m: float, shift_px: float) -> None:
+    size = torch.tensor([4.2, 1.55, 1.8])
+    placed = orbit_box(size, azimuth_deg=azimuth_deg, elevation_deg=20.0, distance_m=distance_m)
+    box = Box3D(placed.center[None], placed.size[None], placed.rotation[None])
+    straight = orbit_camera(64)
+    camera = Camera(straight.intrinsics + torch.tensor([0.0, 0.0, shift_px, 0.0]), 64, 64)
+    hit = to_canonical(image_rays(camera), box).hit.view(64, 64)
+    x, y, width, height = window_of(box, camera)
+    assert 0 <= x <= x + width <= 64
+    assert 0 <= y <= y + height <= 64
+    hit[y : y + height, x : x + width] = False
+    assert not bool(hit.any())
+    if distance_m == 30.0:
+        assert width * height < 64 * 64 / 4
+
+
+@torch.no_grad()
+def test_a_car_out_of_sight_gives_an_empty_picture() -> None:
+    model, patches = small_model(), batch()
+    aside = Box3D(patches.box.center + torch.tensor([60.0, 0.0, 0.0]), patches.box.size, patches.box.rotation)
+    image = render_image(model, orbit_camera(16), model.encode(patches), aside)
+    assert image["rgb"].shape == (16, 16, 3)
+    assert float(image["opacity"].max()) == 0.0

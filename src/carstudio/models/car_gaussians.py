@@ -67,6 +67,7 @@ class CarGaussians(CategoryModel):
     """Encoder, two codes, two decoders."""
 
     tile_px = TILE_PX
+    chunk_rays = 65_536
 
     def __init__(self, config: CarGaussiansConfig) -> None:
         super().__init__()

@@ -14,6 +14,8 @@ from carstudio.geometry.camera import Camera
 from carstudio.rendering.rays import Rays, image_rays, to_canonical
 from carstudio.rendering.volume import Rendering, Segments, composite
 
+NEAR_M = 0.1  # corners nearer to the camera's plane have no place in the image
+
 
 @dataclass(frozen=True)
 class PatchBatch:
@@ -54,6 +56,8 @@ class CategoryModel(nn.Module):
     encoder_side_px: int
     tile_px: int = 1
     """Side of the square of neighbouring pixels whose rays the model likes to get together when an image is drawn."""
+    chunk_rays: int = 8192
+    """Rays of an image that are traced at a time, for memory's sake."""
 
     def load_pretrained_parts(self) -> str:
         """Load what a config asks to start from (an ImageNet encoder); says in words what the encoder starts from."""
@@ -91,23 +95,40 @@ class CategoryModel(nn.Module):
 
 @torch.no_grad()
 def render_image(
-    model: CategoryModel, camera: Camera, latents: Latents, box: Box3D, *, chunk: int = 8192
+    model: CategoryModel, camera: Camera, latents: Latents, box: Box3D, *, chunk: int | None = None
 ) -> dict[str, Float[Tensor, "height width *channel"]]:
     """rgb, opacity and depth_m images of one car (batches of one) through one camera, `chunk` rays at a time.
 
     Only rays that hit the box (or whose tile has one that does) are traced; the others are black, transparent, of depth
-    0. The chunk changes no pixel.
+    0. The chunk (the model's own by default) changes no pixel.
     """
-    rays = image_rays(camera)
-    hit = _tiles_that_hit(to_canonical(rays, box).hit.view(camera.height, camera.width), model.tile_px)
-    count = camera.width * camera.height
-    rgb = rays.directions.new_zeros(count, 3)
-    opacity, depth = rays.directions.new_zeros(count), rays.directions.new_zeros(count)
-    for rows in hit.split(chunk):
-        part = model.render(rays.select(rows), latents, box)
-        rgb[rows], opacity[rows], depth[rows] = part.rgb[0], part.opacity[0], part.depth_m[0]
-    shape = (camera.height, camera.width)
-    return {"rgb": rgb.reshape(*shape, 3), "opacity": opacity.reshape(shape), "depth_m": depth.reshape(shape)}
+    x, y, width, height = window_of(box, camera)
+    seen = camera.crop(x, y, width, height)
+    rays = image_rays(seen)
+    hit = _tiles_that_hit(to_canonical(rays, box).hit.view(height, width), model.tile_px)
+    part = rays.directions.new_zeros(width * height, 5)
+    for rows in hit.split(chunk or model.chunk_rays):
+        found = model.render(rays.select(rows), latents, box)
+        part[rows] = torch.cat([found.rgb[0], found.opacity[0, :, None], found.depth_m[0, :, None]], dim=-1)
+    image = part.new_zeros(camera.height, camera.width, 5)
+    image[y : y + height, x : x + width] = part.unflatten(0, (height, width))
+    return {"rgb": image[..., :3], "opacity": image[..., 3], "depth_m": image[..., 4]}
+
+
+def window_of(box: Box3D, camera: Camera) -> tuple[int, int, int, int]:
+    """x, y, width and height (px) of a part of the image that no ray outside of hits the box (a batch of one).
+
+    The whole image where the box reaches to the camera's plane; empty where it is out of sight.
+    """
+    corners = box.corners()[0]
+    if bool((corners[:, 2] < NEAR_M).any()):
+        return 0, 0, camera.width, camera.height
+    points = camera.project(corners)
+    size = points.new_tensor([camera.width, camera.height])
+    low = (points.amin(dim=0) - 1).floor().clamp(min=0).minimum(size)
+    high = (points.amax(dim=0) + 1).ceil().clamp(min=0).minimum(size)
+    (x0, y0), (x1, y1) = low.int().tolist(), high.int().tolist()
+    return x0, y0, max(0, x1 - x0), max(0, y1 - y0)
 
 
 def _tiles_that_hit(hit: Bool[Tensor, "height width"], side: int) -> Int[Tensor, " pixel"]:

@@ -55,7 +55,7 @@ def encounter(
     table = torch.cat([coefficients.mT, splats.opacity[..., None], rgb], dim=-1).flatten(0, 1)
     taken = table.index_select(0, flat).unflatten(0, candidates.shape)
     return Encounter(
-        taken[..., :10].mT,
+        taken[..., :10].mT.contiguous(),
         taken[..., 10] * is_met,
         taken[..., 11:],
         features.unflatten(1, (-1, TILE)).flatten(0, 1),
