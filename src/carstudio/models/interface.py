@@ -107,7 +107,7 @@ def render_image(
     rays = image_rays(seen)
     hit = _tiles_that_hit(to_canonical(rays, box).hit.view(height, width), model.tile_px)
     part = rays.directions.new_zeros(width * height, 5)
-    for rows in hit.split(chunk or model.chunk_rays):
+    for rows in hit.split(chunk or model.chunk_rays) if len(hit) else ():
         found = model.render(rays.select(rows), latents, box)
         part[rows] = torch.cat([found.rgb[0], found.opacity[0, :, None], found.depth_m[0, :, None]], dim=-1)
     image = part.new_zeros(camera.height, camera.width, 5)
