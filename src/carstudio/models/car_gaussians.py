@@ -47,8 +47,9 @@ class CarGaussiansConfig:
     """Side of a tiny copy of the masked crop, added to the texture code by a linear map; 0: none."""
     sees_photo: bool = False
     """Look up each Gaussian's place (and its mirror image's) in the photo; the findings lengthen the texture code."""
-    is_tinted: bool = False
-    """Colours change with the line of sight (spherical harmonics of degree 1)."""
+    tint_width: int = 64
+    """Rank of the colours' change with the line of sight (spherical harmonics of degree 1); 0: colours are the same
+    from everywhere."""
     kin_size: int = 16
     """Length of the embeddings whose products say how much one Gaussian's colour tells about another's."""
     kin_heads: int = 2
@@ -189,10 +190,11 @@ class ColourDecoder(nn.Module):
         self.colours = nn.Linear(config.width, config.num_splats * 3)
         if config.sees_photo:
             self.spread = ResidualSpread(config)
-        if config.is_tinted:
-            self.tint = nn.Linear(config.width, config.num_splats * 9)
-            nn.init.zeros_(self.tint.weight)
-            nn.init.zeros_(self.tint.bias)
+        if config.tint_width:
+            last = nn.Linear(config.tint_width, config.num_splats * 9)
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
+            self.tint = nn.Sequential(nn.Linear(config.width, config.tint_width), last)
 
     def forward(
         self, latents: Latents
@@ -201,7 +203,7 @@ class ColourDecoder(nn.Module):
         code = latents.texture[:, : self.config.code_size]
         hidden = self.hidden(torch.cat([code, latents.shape.detach()], dim=-1))
         colours = torch.sigmoid(self.colours(hidden).unflatten(-1, (-1, 3)))
-        tint = self.tint(hidden).unflatten(-1, (-1, 3, 3)) if self.config.is_tinted else None
+        tint = self.tint(hidden).unflatten(-1, (-1, 3, 3)) if self.config.tint_width else None
         if not self.config.sees_photo:
             return colours, tint
         photo = latents.texture[:, self.config.code_size :].unflatten(-1, (-1, PHOTO_FEATURES))
