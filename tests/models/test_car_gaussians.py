@@ -247,3 +247,15 @@ def test_a_car_out_of_sight_gives_an_empty_picture() -> None:
     image = render_image(model, orbit_camera(16), model.encode(patches), aside)
     assert image["rgb"].shape == (16, 16, 3)
     assert float(image["opacity"].max()) == 0.0
+
+
+@torch.no_grad()
+def test_reduced_precision_ends_at_the_codes() -> None:
+    model, patches = small_model(), batch()
+    rays = image_rays(orbit_camera(16))
+    latents = model.encode(patches)
+    plain = model.render(rays, latents, patches.box)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        reduced = model.render(rays, latents, patches.box)
+    assert torch.equal(plain.rgb, reduced.rgb)
+    assert torch.equal(plain.opacity, reduced.opacity)

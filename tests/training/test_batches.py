@@ -5,7 +5,7 @@ import torch
 
 from carstudio.dataset.pixels import PatchCache, mirror_patch, prepare_patch
 from carstudio.dataset.store import PatchStore
-from carstudio.training.batches import StepSampler, drawn_pixels, generator_for, pixel_batch
+from carstudio.training.batches import StepSampler, generator_for, pixel_batch
 from training.toy import SIDE_PX, toy_store
 
 
@@ -124,26 +124,3 @@ def test_mirroring_flips_half_of_the_photos_together_or_apart(store: PatchStore)
     assert set(drawn["together"]) == {(False, False), (True, True)}
     assert set(drawn["apart"]) == {(a, b) for a in (False, True) for b in (False, True)}
     assert 160 <= sum(pair[0] for pair in drawn["together"]) <= 240  # half of 400, four standard deviations
-
-
-@pytest.mark.parametrize(("height", "width"), [(20, 30), (5, 3)])
-def test_tiles_of_pixels_lie_together_and_cover_the_photo(height: int, width: int) -> None:
-    generator = torch.Generator().manual_seed(0)
-    row, column = drawn_pixels(torch.Size((height, width)), 4000, 4, generator)
-    counts = torch.zeros(height, width)
-    counts.index_put_((row, column), torch.ones(len(row)), accumulate=True)
-    assert counts.shape == (height, width)
-    assert float(counts.min()) > 0.3 * float(counts.mean())
-    if width >= 4:
-        assert float(counts.max()) < 4 * float(counts.mean())
-    for values in (row, column):
-        tiles = values.view(-1, 16)
-        assert int((tiles.amax(dim=1) - tiles.amin(dim=1)).max()) <= 3
-
-
-def test_a_batch_drawn_in_tiles_carries_the_colours_that_stand_there(store: PatchStore) -> None:
-    prepared = prepare_patch(store.patch("toy-1-2"), 32)
-    pixels = pixel_batch([prepared], 320, torch.Generator().manual_seed(0), tile_px=4)
-    column, row = prepared.camera.project(pixels.rays.directions[0]).floor().long().unbind(-1)
-    assert torch.allclose(pixels.rgb[0], prepared.rgb[row, column].float() / 255)
-    assert row[:16].tolist() == sorted(row[:16].tolist())

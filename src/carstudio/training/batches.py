@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from carstudio.dataset.patch import MaskValue
@@ -69,21 +69,15 @@ def stack_boxes(boxes: list[Box3D]) -> Box3D:
     )
 
 
-def pixel_batch(
-    patches: list[PreparedPatch], rays_per_patch: int, generator: torch.Generator, *, tile_px: int = 1
-) -> PixelBatch:
-    """Pixels drawn evenly, with replacement, from the whole crop of each patch (patches of any size will do).
-
-    With `tile_px` above 1 whole tiles of tile_px x tile_px neighbours are drawn, row by row each, for models that trace
-    rays faster that lie together; `rays_per_patch` is a multiple of a tile.
-    """
-    assert rays_per_patch % tile_px**2 == 0, "rays come in whole tiles"
+def pixel_batch(patches: list[PreparedPatch], rays_per_patch: int, generator: torch.Generator) -> PixelBatch:
+    """Pixels drawn evenly, with replacement, from the whole crop of each patch (patches of any size will do)."""
     positions, rgb, mask = [], [], []
     for patch in patches:
-        row, column = drawn_pixels(patch.mask.shape, rays_per_patch // tile_px**2, tile_px, generator)
-        positions.append(torch.stack([column, row], dim=-1).float() + 0.5)
-        rgb.append(patch.rgb[row, column])
-        mask.append(patch.mask[row, column])
+        height, width = patch.mask.shape
+        picked = torch.randint(height * width, (rays_per_patch,), generator=generator)
+        positions.append(torch.stack([picked % width, picked // width], dim=-1).float() + 0.5)
+        rgb.append(patch.rgb.view(-1, 3)[picked])
+        mask.append(patch.mask.view(-1)[picked])
     intrinsics = torch.stack([patch.camera.intrinsics for patch in patches])
     values = torch.stack(mask)
     return PixelBatch(
@@ -93,26 +87,6 @@ def pixel_batch(
         alpha=(values == MaskValue.CAR).float(),
         is_known=values != MaskValue.UNKNOWN,
     )
-
-
-def drawn_pixels(
-    size: torch.Size, tiles: int, tile_px: int, generator: torch.Generator
-) -> tuple[Int[Tensor, " pixel"], Int[Tensor, " pixel"]]:
-    """Row and column of the pixels of `tiles` random tiles in an image of (height, width).
-
-    Tiles that would stick out are moved inside, so that pixels at the edge are not drawn less often than others.
-    """
-    height, width = size
-    if tile_px == 1:
-        picked = torch.randint(height * width, (tiles,), generator=generator)
-        return picked // width, picked % width
-    corners = torch.rand(tiles, 2, generator=generator) * (torch.tensor([height, width]) + tile_px - 1)
-    most = torch.tensor([height, width]) - tile_px
-    corner = (corners.long() - tile_px + 1).minimum(most).clamp(min=0)
-    inside = torch.arange(tile_px)
-    row = (corner[:, 0, None, None] + inside[:, None]).expand(-1, tile_px, tile_px)
-    column = (corner[:, 1, None, None] + inside).expand(-1, tile_px, tile_px)
-    return row.flatten().clamp(max=height - 1), column.flatten().clamp(max=width - 1)
 
 
 class StepSampler:
@@ -134,10 +108,9 @@ class StepSampler:
         supervision: Supervision,
         seed: int,
         mirroring: Mirroring = "off",
-        tile_px: int = 1,
     ) -> None:
         assert patch_ids, "no patches to train on"
-        self.mirroring, self.tile_px = mirroring, tile_px
+        self.mirroring = mirroring
         self.cache, self.patch_ids, self.seed = cache, patch_ids, seed
         self.patches_per_step, self.supervision = patches_per_step, supervision
         table = cache.store.table(["patch_id", "instance_id"])
@@ -189,8 +162,7 @@ class StepSampler:
         flips = self.mirrored(step)
         shown = [self._patch(patch_id, flip[0]) for patch_id, flip in zip(inputs, flips, strict=True)]
         explained = [self._patch(patch_id, flip[1]) for patch_id, flip in zip(targets, flips, strict=True)]
-        generator = generator_for(self.seed, step, "pixels")
-        pixels = pixel_batch(explained, rays_per_patch, generator, tile_px=self.tile_px)
+        pixels = pixel_batch(explained, rays_per_patch, generator_for(self.seed, step, "pixels"))
         return patch_batch(shown), pixels
 
     def _patch(self, patch_id: str, is_mirrored: bool) -> PreparedPatch:

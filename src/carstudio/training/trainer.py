@@ -49,8 +49,6 @@ class TrainConfig:
     """Cars encoded per step."""
     rays_per_patch: int = 1024
     """Pixels per patch and step."""
-    tile_px: int = 1
-    """Side of the squares of neighbouring pixels that rays are drawn in; 1: each pixel by itself."""
     steps: int = 500_000
     """Length of the run."""
     minutes: float | None = None
@@ -179,7 +177,6 @@ class _Run:
             supervision=config.supervision,
             seed=config.seed,
             mirroring=config.mirroring,
-            tile_px=config.tile_px,
         )
 
     def begin(self, *, init: Path | None) -> None:
