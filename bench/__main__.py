@@ -1,7 +1,8 @@
 """Speed and memory of this machine: `./run bench` (or `python -m bench`) prints a Markdown table.
 
-Training: one step (encode, trace, loss, backward, RAdam) of a recipe with its own number of patches and --rays rays of
-each (the activations of a paper-size step, 3 x 1,024 rays, may not fit a laptop). Rendering: one view of --size px.
+Training: one step (encode, trace, loss, backward, RAdam) of a recipe with its own number of patches and rays, or --rays
+rays of each patch (128 for paper-size recipes: the activations of 3 x 1,024 rays may not fit a laptop). Rendering: one
+view of --size px of a car whose photo has been encoded before.
 Rounds of the recipes are interleaved and medians are given, because shared machines drift; the ratio is to the first
 recipe within the same round. Memory is how far the first step raises the peak of the process.
 """
@@ -33,12 +34,14 @@ class Subject:
     """A recipe with a fresh model, ready to train a step and to render a view."""
 
     def __init__(
-        self, name: str, device: torch.device, *, rays_per_patch: int, size_px: int, precision: Precision | None
+        self, name: str, device: torch.device, *, rays_per_patch: int | None, size_px: int, precision: Precision | None
     ) -> None:
         self.name, self.device, self.config = name, device, recipe(name)
         torch.manual_seed(0)
         self.model = build_model(self.config.model).to(device)
         self.optimizer = torch.optim.RAdam(self.model.parameters(), lr=1e-4)
+        own = self.config.rays_per_patch
+        rays_per_patch = rays_per_patch or (own if own <= 512 else 128)
         batch = random_batch(self.config.patches_per_step, rays_per_patch, self.model.encoder_side_px)
         self.patches, self.pixels = (part.to(device) for part in batch)
         self.precision = precision or self.config.precision
@@ -58,13 +61,17 @@ class Subject:
         torch.stack(list(terms.values())).sum().backward()
         self.optimizer.step()
 
-    def render_view(self) -> None:
-        """One view of the first car."""
+    def encode_first(self) -> None:
+        """Latents of the first car, from which its views are rendered."""
         self.model.eval()
         with torch.no_grad():
-            latents = self.model.encode(self.patches).select(0)
+            self.latents = self.model.encode(self.patches).select(0)
+
+    def render_view(self) -> None:
+        """One view of the first car, decoding its latents included, encoding its photo not."""
+        self.model.eval()
         box = type(self.pixels.box)(*(value[:1] for value in vars(self.pixels.box).values()))
-        render_image(self.model, orbit_camera(self.size_px), latents, box)
+        render_image(self.model, orbit_camera(self.size_px).to(self.device), self.latents, box)
 
 
 def measure(action: Callable[[], None], device: torch.device) -> tuple[float, float]:
@@ -79,10 +86,12 @@ def measure(action: Callable[[], None], device: torch.device) -> tuple[float, fl
 def main() -> None:
     """Run and print."""
     parser = argparse.ArgumentParser(prog="bench", description="Training and rendering speed of recipes")
-    parser.add_argument("--recipes", nargs="+", default=["car-nerf", "car-nerf-small"])
+    parser.add_argument(
+        "--recipes", nargs="+", default=["car-nerf", "car-nerf-small", "car-gaussians", "car-gaussians-preview"]
+    )
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--rays", type=int, default=128, help="rays per patch of a training step")
-    parser.add_argument("--size", type=int, default=64, help="side of the rendered view, px")
+    parser.add_argument("--rays", type=int, help="rays per patch of a training step; the recipe's own, at most 512")
+    parser.add_argument("--size", type=int, default=128, help="side of the rendered view, px")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--precision", choices=["auto", "float32", "bfloat16"], help="of training; the recipe's own")
     parser.add_argument("--json", action="store_true")
@@ -96,6 +105,7 @@ def main() -> None:
     for subject in subjects:  # warm-up, and the peak memory of one step
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         subject.train_step()
+        subject.encode_first()
         memory[subject.name] = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
     for _ in range(options.rounds):
         for subject in subjects:
@@ -116,6 +126,8 @@ def row(
         "precision": resolve_precision(subject.precision, subject.device),
         "train_rays_per_s": subject.rays / statistics.median(wall for wall, _ in train),
         "train_rays_per_cpu_s": subject.rays / statistics.median(cpu for _, cpu in train),
+        "patches": subject.config.patches_per_step,
+        "rays_per_patch": subject.rays // subject.config.patches_per_step,
         "train_ratio": statistics.median((b[1] / base.rays) / (a[1] / subject.rays) for a, b in pairs),
         "render_rays_per_s": subject.size_px**2 / statistics.median(wall for wall, _ in render),
         "render_rays_per_cpu_s": subject.size_px**2 / statistics.median(cpu for _, cpu in render),
@@ -127,17 +139,22 @@ def table(rows: list[dict[str, float | str]], device: torch.device, options: arg
     """Markdown."""
     lines = [
         f"torch {torch.__version__}, {device}, {torch.get_num_threads()} threads, {platform.machine()}; "
-        f"medians of {options.rounds} interleaved rounds; {options.rays} rays per patch and training step; ratio per "
-        f"processor second; render: one {options.size} x {options.size} view, rays that miss the box included.",
+        f"medians of {options.rounds} interleaved rounds; ratio per "
+        f"processor second; render: one {options.size} x {options.size} view, rays that miss the box included; "
+        "MiB: memory of a step.",
         "",
-        "| recipe | precision | train rays/s | per CPU-s | ratio | render rays/s | per CPU-s | step memory (MiB) |",
-        "|---|---|---:|---:|---:|---:|---:|---:|",
+        "| recipe | patches x rays | precision | train rays/s | per CPU-s | ratio | render rays/s | per CPU-s | MiB |",
+        "|---|---|---|---:|---:|---:|---:|---:|---:|",
     ]
     for found in rows:
         figures = [f"{found[key]:,.0f}" for key in ("train_rays_per_s", "train_rays_per_cpu_s")]
         figures += [f"{found['train_ratio']:.1f}"]
         figures += [f"{found[key]:,.0f}" for key in ("render_rays_per_s", "render_rays_per_cpu_s", "step_memory_mib")]
-        lines.append(f"| {found['recipe']} | {found['precision']} | " + " | ".join(figures) + " |")
+        lines.append(
+            f"| {found['recipe']} | {found['patches']} x {found['rays_per_patch']} | {found['precision']} | "
+            + " | ".join(figures)
+            + " |"
+        )
     return "\n".join(lines)
 
 

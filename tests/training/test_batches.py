@@ -3,7 +3,7 @@ from collections import Counter
 import pytest
 import torch
 
-from carstudio.dataset.pixels import PatchCache, prepare_patch
+from carstudio.dataset.pixels import PatchCache, mirror_patch, prepare_patch
 from carstudio.dataset.store import PatchStore
 from carstudio.training.batches import StepSampler, generator_for, pixel_batch
 from training.toy import SIDE_PX, toy_store
@@ -56,9 +56,9 @@ def test_streams_and_steps_do_not_share_numbers() -> None:
         tuple(torch.rand(4, generator=generator_for(seed, step, stream)).tolist())
         for seed in range(3)
         for step in range(20)
-        for stream in ("epoch", "target", "pixels", "jitter")
+        for stream in ("epoch", "target", "pixels", "jitter", "mirror")
     }
-    assert len(draws) == 3 * 20 * 4
+    assert len(draws) == 3 * 20 * 5
 
 
 def test_pixels_carry_the_colour_that_stands_there(store: PatchStore) -> None:
@@ -90,3 +90,37 @@ def test_encoder_camera_sees_the_resized_crop(store: PatchStore) -> None:
     prepared = prepare_patch(store.patch("toy-0-1"), 80)  # twice the crop
     corner = torch.tensor([[1.0, 0.5, 5.0]])
     assert torch.allclose(prepared.encoder_camera.project(corner), 2 * prepared.camera.project(corner), atol=1e-4)
+
+
+def test_a_mirrored_patch_is_the_flipped_photo_of_the_mirrored_car(store: PatchStore) -> None:
+    """A point of the car has the colour that its mirror image has in the flipped photo, in crop and encoder image."""
+    patch = prepare_patch(store.patch(store.patch_ids()[0]), 32)
+    mirrored = mirror_patch(patch)
+    points = torch.tensor([[1.2, 0.1, 0.4], [-0.8, -0.2, -0.6], [0.0, 0.0, 0.0]])
+    for name, camera in (("rgb", "camera"), ("encoder_image", "encoder_camera")):
+        seen = []
+        for photo, side in ((patch, 1.0), (mirrored, -1.0)):
+            in_camera = points * torch.tensor([1.0, 1.0, side]) @ photo.box.rotation.mT + photo.box.center
+            column, row = getattr(photo, camera).project(in_camera).floor().long().unbind(-1)
+            pixels = getattr(photo, name)
+            seen.append(pixels[row, column] if name == "rgb" else pixels[:, row, column].mT)
+        assert torch.equal(*seen), name
+    assert torch.equal(mirror_patch(mirrored).rgb, patch.rgb)
+    assert torch.equal(mirrored.mask, patch.mask.flip(1))
+
+
+def test_mirroring_flips_half_of_the_photos_together_or_apart(store: PatchStore) -> None:
+    cache = PatchCache(store, 32)
+    drawn = {}
+    for mirroring in ("off", "together", "apart"):
+        sampled = StepSampler(
+            cache, store.patch_ids(), patches_per_step=5, supervision="single-view", seed=0, mirroring=mirroring
+        )
+        drawn[mirroring] = [pair for step in range(80) for pair in sampled.mirrored(step)]
+        patches, pixels = sampled.batch(3, 16)
+        same = torch.isclose(patches.box.rotation, pixels.box.rotation).flatten(1).all(dim=-1).tolist()
+        assert same == [a == b for a, b in sampled.mirrored(3)]
+    assert set(drawn["off"]) == {(False, False)}
+    assert set(drawn["together"]) == {(False, False), (True, True)}
+    assert set(drawn["apart"]) == {(a, b) for a in (False, True) for b in (False, True)}
+    assert 160 <= sum(pair[0] for pair in drawn["together"]) <= 240  # half of 400, four standard deviations

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from carstudio.rendering.volume import Rendering
-from carstudio.training.losses import LossConfig, colour_error, masked_psnr, training_loss
+from carstudio.training.losses import LossConfig, best_gain, colour_error, masked_psnr, training_loss
 
 
 def rendering(rgb: torch.Tensor, opacity: torch.Tensor) -> Rendering:
@@ -70,3 +70,18 @@ def test_psnr_of_a_tenth_is_20_db() -> None:
     truth = torch.full((1, 3, 3), 0.5)
     shown = rendering(truth + torch.tensor([0.1, 0.1, 9.0])[None, :, None], torch.ones(1, 3))
     assert masked_psnr(shown, truth, torch.tensor([[1.0, 1.0, 0.0]])) == pytest.approx(20.0, abs=1e-4)
+
+
+def test_the_best_gain_is_the_best_of_many_and_forgives_exposure() -> None:
+    levels, rgb, alpha, _ = random_case()
+    rendered = levels[0].rgb
+    gain = best_gain(rendered, rgb, alpha)
+    for car in range(2):
+        tried = torch.linspace(0.5, 2.0, 1501)
+        errors = (alpha[car, :, None] * (rendered[car] * tried[:, None, None] - rgb[car]) ** 2).sum(dim=(1, 2))
+        assert float(gain[car]) == pytest.approx(float(tried[errors.argmin()]), abs=1e-3)
+    brighter = (rendering(rendered, alpha),)
+    everywhere = torch.ones(2, 5, dtype=torch.bool)
+    config = LossConfig(exposed_share=1.0)
+    assert float(training_loss(brighter, rendered * 1.4, alpha, everywhere, config)["colour_fine"]) < 1e-12
+    assert float(training_loss(brighter, rendered * 1.4, alpha, everywhere, LossConfig())["colour_fine"]) > 1e-3

@@ -23,7 +23,8 @@ class Train(Output):
     """Train a category model on a CarPatch3D store."""
 
     recipe: tyro.conf.Positional[str]
-    """car-nerf, car-nerf-no-mask, car-nerf-as-released or car-nerf-small."""
+    """car-gaussians (fast), car-gaussians-preview (fastest), car-nerf (the paper's), car-nerf-no-mask,
+    car-nerf-as-released or car-nerf-small."""
     data: Path
     """The CarPatch3D store."""
     out: Path

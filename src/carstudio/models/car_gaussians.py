@@ -17,6 +17,7 @@ from carstudio.models.interface import CategoryModel, Latents, PatchBatch
 from carstudio.models.patch_features import POSE_FEATURES, pose_features, tiny_masked_copy
 from carstudio.models.photo_features import PHOTO_FEATURES, photo_at
 from carstudio.rendering.gaussians.cloud import GaussianCloud
+from carstudio.rendering.gaussians.tiles import TILE_PX
 from carstudio.rendering.gaussians.tracing import SplattingConfig, render_cloud, trace_cloud
 from carstudio.rendering.rays import Rays, to_canonical
 from carstudio.rendering.volume import Rendering, Segments
@@ -44,18 +45,30 @@ class CarGaussiansConfig:
     """Gaussians come in pairs mirrored in the car's middle plane; colours are free."""
     colour_skip_px: int = 8
     """Side of a tiny copy of the masked crop, added to the texture code by a linear map; 0: none."""
-    sees_photo: bool = True
+    sees_photo: bool = False
     """Look up each Gaussian's place (and its mirror image's) in the photo; the findings lengthen the texture code."""
-    embedding: int = 16
-    """Length of what the colour decoder knows about each Gaussian."""
+    tint_width: int = 64
+    """Rank of the colours' change with the line of sight (spherical harmonics of degree 1); 0: colours are the same
+    from everywhere."""
+    kin_size: int = 16
+    """Length of the embeddings whose products say how much one Gaussian's colour tells about another's."""
+    kin_heads: int = 2
+    """Kinds of such kinship."""
     least_scale: float = 0.01
     """Smallest standard deviation of a Gaussian, canonical units."""
     largest_scale: float = 0.5
     """Largest standard deviation, canonical units."""
 
+    def __post_init__(self) -> None:
+        assert not self.is_symmetric or self.num_splats % 2 == 0, "mirrored pairs need an even number of Gaussians"
+        assert 0 < self.least_scale < self.largest_scale, "scales are positive, the least below the largest"
+
 
 class CarGaussians(CategoryModel):
     """Encoder, two codes, two decoders."""
+
+    tile_px = TILE_PX
+    chunk_rays = 65_536
 
     def __init__(self, config: CarGaussiansConfig) -> None:
         super().__init__()
@@ -85,13 +98,15 @@ class CarGaussians(CategoryModel):
         if self.config.sees_photo:
             with torch.no_grad(), torch.autocast(patches.image.device.type, enabled=False):
                 mean = self.geometry(shape.to(patches.image.dtype))[0]
-                texture = torch.cat([texture, photo_at(mean, patches).flatten(1).to(texture.dtype)], dim=-1)
+                photo = photo_at(mean, patches).flatten(1).to(texture.dtype)
+            texture = torch.cat([texture, photo], dim=-1)
         return Latents(shape, texture)
 
     def decode(self, latents: Latents) -> GaussianCloud:
         """The car's Gaussians in the canonical frame."""
         mean, log_scale, quaternion, opacity = self.geometry(latents.shape)
-        return GaussianCloud(mean, log_scale, quaternion, opacity, self.colour(latents))
+        rgb, tint = self.colour(latents)
+        return GaussianCloud(mean, log_scale, quaternion, opacity, rgb, tint)
 
     def trace_levels(
         self, rays: Rays, latents: Latents, box: Box3D, generator: torch.Generator | None = None
@@ -123,7 +138,6 @@ class GeometryDecoder(nn.Module):
 
     def __init__(self, config: CarGaussiansConfig) -> None:
         super().__init__()
-        assert not config.is_symmetric or config.num_splats % 2 == 0, "mirrored pairs need an even number"
         self.config = config
         count = config.num_splats // 2 if config.is_symmetric else config.num_splats
         self.hidden = nn.Sequential(nn.Linear(config.code_size, config.width), nn.SiLU())
@@ -165,8 +179,8 @@ class GeometryDecoder(nn.Module):
 class ColourDecoder(nn.Module):
     """Texture code (and the detached shape code) to a colour per Gaussian.
 
-    Where the photo was looked up, the colour is a mix of what the code says, what the photo shows at the Gaussian and
-    what it shows at the Gaussian's mirror image.
+    Where the photo was looked up, what it shows differently from what the code says spreads from seen Gaussians to
+    related ones (`ResidualSpread`).
     """
 
     def __init__(self, config: CarGaussiansConfig) -> None:
@@ -175,28 +189,49 @@ class ColourDecoder(nn.Module):
         self.hidden = nn.Sequential(nn.Linear(2 * config.code_size, config.width), nn.SiLU())
         self.colours = nn.Linear(config.width, config.num_splats * 3)
         if config.sees_photo:
-            self.embedding = nn.Parameter(torch.randn(config.num_splats, config.embedding))
-            self.context = nn.Linear(config.width, config.embedding)
-            self.mix = nn.Sequential(
-                nn.Linear(2 * PHOTO_FEATURES + 2 * config.embedding, 64), nn.SiLU(), nn.Linear(64, 6)
-            )
+            self.spread = ResidualSpread(config)
+        if config.tint_width:
+            last = nn.Linear(config.tint_width, config.num_splats * 9)
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
+            self.tint = nn.Sequential(nn.Linear(config.width, config.tint_width), last)
 
-    def forward(self, latents: Latents) -> Float[Tensor, "batch splat 3"]:
-        """Rgb in [0, 1]."""
+    def forward(
+        self, latents: Latents
+    ) -> tuple[Float[Tensor, "batch splat 3"], Float[Tensor, "batch splat 3 3"] | None]:
+        """Colours in [0, 1], and their change with the line of sight where the config asks for one."""
         code = latents.texture[:, : self.config.code_size]
         hidden = self.hidden(torch.cat([code, latents.shape.detach()], dim=-1))
-        colours = self.colours(hidden).unflatten(-1, (-1, 3))
+        colours = torch.sigmoid(self.colours(hidden).unflatten(-1, (-1, 3)))
+        tint = self.tint(hidden).unflatten(-1, (-1, 3, 3)) if self.config.tint_width else None
         if not self.config.sees_photo:
-            return torch.sigmoid(colours)
+            return colours, tint
         photo = latents.texture[:, self.config.code_size :].unflatten(-1, (-1, PHOTO_FEATURES))
-        other = photo.roll(self.config.num_splats // 2, dims=1)
-        context = self.context(hidden)[:, None].expand(-1, self.config.num_splats, -1)
-        known = torch.cat([photo, other, context, self.embedding.expand(len(code), -1, -1)], dim=-1)
-        mixed = self.mix(known)
-        own = torch.sigmoid(colours + mixed[..., :3])
-        share = mixed[..., 3:].softmax(dim=-1) * torch.stack(
-            [torch.ones_like(photo[..., 3]), photo[..., 3], other[..., 3]], dim=-1
-        )
-        share = share / share.sum(dim=-1, keepdim=True)
-        seen, mirrored = (found[..., :3] / found[..., 3:].clamp(min=1e-3) for found in (photo, other))
-        return share[..., :1] * own + share[..., 1:2] * seen + share[..., 2:] * mirrored
+        return (colours + self.spread(colours, photo)).clamp(0, 1), tint
+
+
+class ResidualSpread(nn.Module):
+    """How a surprise at one Gaussian tells on the others: learned kinship, the same for all cars.
+
+    r_h = photo - colour where Gaussian h is seen (visibility v_h); Gaussian g is corrected by the mean of r_h over its
+    kin, sum_h a_gh v_h r_h / (sum_h a_gh v_h + few), a = softmax(q k^T): paint learns from paint, wheels from wheels.
+    """
+
+    def __init__(self, config: CarGaussiansConfig) -> None:
+        super().__init__()
+        count, heads, size = config.num_splats, config.kin_heads, config.kin_size
+        self.query = nn.Parameter(torch.randn(heads, count, size) * 0.5)
+        self.key = nn.Parameter(torch.randn(heads, count, size) * 0.5)
+        self.trust = nn.Parameter(torch.full((heads, count, 1), 0.0))
+        self.few = 0.02
+
+    def forward(
+        self, colours: Float[Tensor, "batch splat 3"], photo: Float[Tensor, "batch splat 4"]
+    ) -> Float[Tensor, "batch splat 3"]:
+        """What to add to the colours."""
+        seen = photo[..., 3:]
+        values = torch.cat([photo[..., :3] - seen * colours, seen], dim=-1)
+        kinship = torch.softmax(self.query @ self.key.mT, dim=-1)
+        gathered = kinship @ values[:, None]
+        mean = gathered[..., :3] / (gathered[..., 3:] + self.few)
+        return (torch.sigmoid(self.trust) * mean).sum(dim=1)

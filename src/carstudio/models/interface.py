@@ -6,7 +6,7 @@ Fitting, editing, evaluation, export and the viewer know only this. One car per 
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from carstudio.errors import InputError
@@ -14,6 +14,8 @@ from carstudio.geometry.box3d import Box3D
 from carstudio.geometry.camera import Camera
 from carstudio.rendering.rays import Rays, image_rays, to_canonical
 from carstudio.rendering.volume import Rendering, Segments, composite
+
+NEAR_M = 0.1  # corners nearer to the camera's plane have no place in the image
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,10 @@ class CategoryModel(nn.Module):
     """Base of all models. Subclasses give `encode` and `trace_levels`, and the side of the images they encode."""
 
     encoder_side_px: int
+    tile_px: int = 1
+    """Side of the square of neighbouring pixels whose rays the model likes to get together when an image is drawn."""
+    chunk_rays: int = 8192
+    """Rays of an image that are traced at a time, for memory's sake."""
 
     def load_pretrained_parts(self) -> str:
         """Load what a config asks to start from (an ImageNet encoder); says in words what the encoder starts from."""
@@ -75,7 +81,9 @@ class CategoryModel(nn.Module):
         self, rays: Rays, latents: Latents, box: Box3D, generator: torch.Generator | None = None
     ) -> tuple[Rendering, ...]:
         """Composited segments of each level, what training compares; a model may have a shorter way to them."""
-        return tuple(composite(segments) for segments in self.trace_levels(rays, latents, box, generator))
+        levels = self.trace_levels(rays, latents, box, generator)
+        with torch.autocast(rays.directions.device.type, enabled=False):
+            return tuple(composite(segments) for segments in levels)
 
     def trace(self, rays: Rays, latents: Latents, box: Box3D) -> Segments:
         """Segments in metres, ordered along each ray; several cars and a background merge through them."""
@@ -88,25 +96,55 @@ class CategoryModel(nn.Module):
 
 @torch.no_grad()
 def render_image(
-    model: CategoryModel, camera: Camera, latents: Latents, box: Box3D, *, chunk: int = 8192
+    model: CategoryModel, camera: Camera, latents: Latents, box: Box3D, *, chunk: int | None = None
 ) -> dict[str, Float[Tensor, "height width *channel"]]:
     """rgb, opacity and depth_m images of one car (batches of one) through one camera, `chunk` rays at a time.
 
-    Only rays that hit the box are traced; the others are black, transparent, of depth 0. The chunk changes no pixel.
-    `InputError` when the weights, though finite themselves, give numbers that are not.
+    Only rays that hit the box (or whose tile has one that does) are traced; the others are black, transparent, of depth
+    0. The chunk (the model's own by default) changes no pixel. `InputError` when the weights, though finite themselves,
+    give numbers that are not.
     """
-    rays = image_rays(camera)
-    hit = to_canonical(rays, box).hit[0].nonzero().squeeze(-1)
-    count = camera.width * camera.height
-    rgb = rays.directions.new_zeros(count, 3)
-    opacity, depth = rays.directions.new_zeros(count), rays.directions.new_zeros(count)
-    for rows in hit.split(chunk):
-        part = model.render(rays.select(rows), latents, box)
-        rgb[rows], opacity[rows], depth[rows] = part.rgb[0], part.opacity[0], part.depth_m[0]
-    if not all(bool(values.isfinite().all()) for values in (rgb, opacity, depth)):
+    x, y, width, height = window_of(box, camera)
+    seen = camera.crop(x, y, width, height)
+    rays = image_rays(seen)
+    hit = _tiles_that_hit(to_canonical(rays, box).hit.view(height, width), model.tile_px)
+    part = rays.directions.new_zeros(width * height, 5)
+    for rows in hit.split(chunk or model.chunk_rays) if len(hit) else ():
+        found = model.render(rays.select(rows), latents, box)
+        part[rows] = torch.cat([found.rgb[0], found.opacity[0, :, None], found.depth_m[0, :, None]], dim=-1)
+    if not bool(part.isfinite().all()):
         raise InputError(
             "the model's picture is not made of finite numbers: its weights are damaged, or its training ran away; use "
             "another run"
         )
-    shape = (camera.height, camera.width)
-    return {"rgb": rgb.reshape(*shape, 3), "opacity": opacity.reshape(shape), "depth_m": depth.reshape(shape)}
+    image = part.new_zeros(camera.height, camera.width, 5)
+    image[y : y + height, x : x + width] = part.unflatten(0, (height, width))
+    return {"rgb": image[..., :3], "opacity": image[..., 3], "depth_m": image[..., 4]}
+
+
+def window_of(box: Box3D, camera: Camera) -> tuple[int, int, int, int]:
+    """x, y, width and height (px) of a part of the image that no ray outside of hits the box (a batch of one).
+
+    The whole image where the box reaches to the camera's plane; empty where it is out of sight.
+    """
+    corners = box.corners()[0]
+    if bool((corners[:, 2] < NEAR_M).any()):
+        return 0, 0, camera.width, camera.height
+    points = camera.project(corners)
+    size = points.new_tensor([camera.width, camera.height])
+    low = (points.amin(dim=0) - 1).floor().clamp(min=0).minimum(size)
+    high = (points.amax(dim=0) + 1).ceil().clamp(min=0).minimum(size)
+    (x0, y0), (x1, y1) = low.int().tolist(), high.int().tolist()
+    return x0, y0, max(0, x1 - x0), max(0, y1 - y0)
+
+
+def _tiles_that_hit(hit: Bool[Tensor, "height width"], side: int) -> Int[Tensor, " pixel"]:
+    """Pixel numbers of all side x side tiles with a hit, tile by tile; tiles at the edge repeat their pixels."""
+    height, width = hit.shape
+    padded = torch.nn.functional.pad(hit, (0, -width % side, 0, -height % side))
+    touched = padded.unflatten(0, (-1, side)).unflatten(2, (-1, side)).any(dim=3).any(dim=1)
+    row, column = touched.nonzero().unbind(-1)
+    inside = torch.arange(side, device=hit.device)
+    rows = (row[:, None] * side + inside).clamp(max=height - 1)
+    columns = (column[:, None] * side + inside).clamp(max=width - 1)
+    return (rows[:, :, None] * width + columns[:, None]).flatten()

@@ -21,6 +21,15 @@ class GaussianCloud:
     quaternion: Float[Tensor, "batch splat 4"]
     opacity: Float[Tensor, "batch splat"]
     rgb: Float[Tensor, "batch splat 3"]
+    tint: Float[Tensor, "batch splat 3 3"] | None = None
+    """Change of each channel with the line of sight (canonical unit vector), degree 1; or none."""
+
+    def colour_from(self, eye: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch splat 3"]:
+        """What a camera there (canonical) sees: rgb, tinted by the direction from which each Gaussian is seen."""
+        if self.tint is None:
+            return self.rgb
+        sight = torch.nn.functional.normalize(self.mean.detach() - eye[:, None], dim=-1)
+        return (self.rgb + (self.tint @ sight[..., None]).squeeze(-1)).clamp(0, 1)
 
     def covariance(self) -> Float[Tensor, "batch splat 3 3"]:
         """R diag(s^2) R^T."""
@@ -35,6 +44,7 @@ class GaussianCloud:
             self.quaternion * self.quaternion.new_tensor([1.0, -1.0, -1.0, 1.0]),
             self.opacity,
             self.rgb,
+            None if self.tint is None else self.tint * self.mean.new_tensor([1.0, 1.0, -1.0]),
         )
 
 

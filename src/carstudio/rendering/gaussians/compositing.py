@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-CHUNK_ROWS = 8  # batch entries at a time, so that the spread weights stay small
+_CHUNK = {"cpu": 2**17, "other": 2**26}  # spread weights at a time: on a CPU they fit the cache
 
 
 def composite_hits(
@@ -32,11 +32,11 @@ class _CompositeHits(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, alpha: Tensor, t: Tensor, index: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        passed = torch.cumsum(torch.log1p(-alpha), dim=-1)
-        weights = torch.exp(passed[..., :-1])
-        weights = torch.cat([torch.ones_like(alpha[..., :1]), weights], dim=-1).mul_(alpha)
+        weights = torch.log1p(-alpha).cumsum_(dim=-1).exp_().roll(1, dims=-1)  # what passes each hit, at the next
+        weights[..., 0] = 1
+        weights.mul_(alpha)
         colour = torch.empty(*alpha.shape[:2], 3, dtype=rgb.dtype, device=rgb.device)
-        for rows in _rows(len(alpha)):
+        for rows in _rows(alpha, rgb.shape[1]):
             colour[rows] = _spread(weights[rows], index[rows], rgb.shape[1]) @ rgb[rows]
         sums = torch.stack([weights.sum(dim=-1), (weights * t).sum(dim=-1)], dim=-1)
         ctx.save_for_backward(alpha, t, index, rgb, weights)
@@ -49,7 +49,7 @@ class _CompositeHits(torch.autograd.Function):
         to_colour, to_sums = gradients[0], gradients[1]
         slope = torch.empty_like(alpha)
         to_rgb = torch.empty_like(rgb)
-        for rows in _rows(len(alpha)):
+        for rows in _rows(alpha, rgb.shape[1]):
             to_rgb[rows] = _spread(weights[rows], index[rows], rgb.shape[1]).mT @ to_colour[rows]
             slope[rows] = torch.gather(to_colour[rows] @ rgb[rows].mT, -1, index[rows])
         slope.add_(to_sums[..., :1]).addcmul_(to_sums[..., 1:], t)
@@ -60,8 +60,10 @@ class _CompositeHits(torch.autograd.Function):
         return to_alpha, weights * to_sums[..., 1:], None, to_rgb
 
 
-def _rows(batch: int) -> list[slice]:
-    return [slice(first, first + CHUNK_ROWS) for first in range(0, batch, CHUNK_ROWS)]
+def _rows(alpha: Tensor, num_splats: int) -> list[slice]:
+    size = _CHUNK["cpu" if alpha.device.type == "cpu" else "other"]
+    rows = max(1, size // (alpha.shape[1] * num_splats))
+    return [slice(first, first + rows) for first in range(0, len(alpha), rows)]
 
 
 def _spread(values: Tensor, index: Tensor, num_splats: int) -> Tensor:

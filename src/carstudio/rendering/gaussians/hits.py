@@ -34,9 +34,26 @@ def ray_hits(
     `points` within two units of the origin. Peaks at t <= `nearest` (the camera) count as missed. Gradients flow to the
     splats through alpha and t, in closed form; points and directions get none.
     """
-    coefficients = splat_coefficients(splats)
     features = torch.cat(ray_features(points, directions), dim=-1)
-    return _Hits.apply(coefficients, splats.opacity, features, nearest, most)
+    return hits_of_features(splat_coefficients(splats), splats.opacity, features, nearest, most=most)
+
+
+def hits_of_features(
+    coefficients: Float[Tensor, "batch 10 splat"],
+    opacity: Float[Tensor, "batch splat"],
+    features: Float[Tensor, "batch ray 25"],
+    nearest: Float[Tensor, "batch ray"],
+    *,
+    most: int,
+) -> tuple[Float[Tensor, "batch ray hit"], Float[Tensor, "batch ray hit"], Int[Tensor, "batch ray hit"]]:
+    """`ray_hits` of what `splat_coefficients` and `ray_features` (joined) give; opacity 0 is never hit."""
+    alpha, t, index = _Hits.apply(coefficients, opacity, features, nearest, most)
+    return alpha, t, index
+
+
+def reach_limit(opacity: Float[Tensor, "batch splat"]) -> Float[Tensor, "batch splat"]:
+    """Squared distance at which a Gaussian's alpha is the faintest that counts; negative: it never does."""
+    return 2 * torch.log((opacity / FAINTEST).clamp(min=1e-12))
 
 
 def splat_coefficients(splats: Splats) -> Float[Tensor, "batch 10 splat"]:
@@ -73,7 +90,7 @@ class _Hits(torch.autograd.Function):
         alpha, t = (features.new_empty(batch, num_rays, most) for _ in range(2))
         index = torch.empty(batch, num_rays, most, dtype=torch.int64, device=features.device)
         peak = features.new_empty(batch, num_rays, most)
-        limit = 2 * torch.log((opacity / FAINTEST).clamp(min=1e-12))
+        limit = reach_limit(opacity)
         for entries, rays in _chunks(features, num_splats):
             keys, over, at = _keys(
                 features[entries, rays], coefficients[entries], limit[entries], nearest[entries, rays]
@@ -147,7 +164,7 @@ def _keys(features: Tensor, coefficients: Tensor, limit: Tensor, nearest: Tensor
     t = b.div(features[..., 19:] @ coefficients[:, :6])
     over.addcmul_(b, t, value=-1 / scale**2)
     last = 2 ** (29 - _bits(num_splats))
-    place = torch.add(t, over.clamp(min=0), alpha=1e9)
+    place = torch.add(t, over.clamp(min=0), alpha=1e12)
     if bool((nearest > -_REACH).any()):  # the camera is so near that Gaussians may lie behind it
         place = torch.where(t <= nearest[..., None] * scale, float(last), place)
     keys = place.clamp_(-last, last - 1).to(torch.int32).mul_(2 ** _bits(num_splats))

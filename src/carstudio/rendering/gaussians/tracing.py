@@ -3,13 +3,14 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from carstudio.rendering.gaussians.cloud import GaussianCloud, Splats, splats_of, widened_splats
 from carstudio.rendering.gaussians.compositing import composite_hits
-from carstudio.rendering.gaussians.hits import ray_hits
+from carstudio.rendering.gaussians.hits import hits_of_features
 from carstudio.rendering.gaussians.reference import sorted_responses
+from carstudio.rendering.gaussians.tiles import encounter
 from carstudio.rendering.rays import CanonicalRays, Rays
 from carstudio.rendering.volume import Rendering, Segments
 
@@ -31,47 +32,61 @@ def trace_cloud(cloud: GaussianCloud, rays: Rays, canonical: CanonicalRays, conf
 
     All metric: the peak's distance along the ray, its depth, its alpha; rgb is the Gaussian's.
     """
-    alpha, t, index, middle = _hits(cloud, canonical, config)
-    distance = (t + middle[..., None]) / canonical.stretch[..., None]
-    flat = (index + cloud.rgb.shape[1] * torch.arange(len(index), device=index.device)[:, None, None]).flatten()
-    rgb = cloud.rgb.flatten(0, 1).index_select(0, flat).unflatten(0, index.shape)
+    hits = _hits(cloud, rays, canonical, config)
+    shape = (*canonical.hit.shape, hits.alpha.shape[-1])
+    distance = (hits.t.reshape(shape) + hits.middle[..., None]) / canonical.stretch[..., None]
+    groups = torch.arange(len(hits.index), device=hits.index.device)[:, None, None]
+    flat = (hits.index + hits.rgb.shape[1] * groups).flatten()
+    rgb = hits.rgb.flatten(0, 1).index_select(0, flat).unflatten(0, shape)
+    alpha = hits.alpha.reshape(shape) * canonical.hit[..., None]
     return Segments(distance, distance * rays.directions[..., 2:], alpha, rgb)
 
 
 def render_cloud(cloud: GaussianCloud, rays: Rays, canonical: CanonicalRays, config: SplattingConfig) -> Rendering:
     """What `composite` makes of `trace_cloud`'s segments, without laying out the segments' colours."""
-    alpha, t, index, middle = _hits(cloud, canonical, config)
-    rgb, sums, weights = composite_hits(alpha, t, index, cloud.rgb)
+    hits = _hits(cloud, rays, canonical, config)
+    rgb, sums, weights = composite_hits(hits.alpha, hits.t, hits.index, hits.rgb)
+    shape, hit = canonical.hit.shape, canonical.hit[..., None]
+    rgb, sums, weights = rgb.reshape(*shape, 3) * hit, sums.reshape(*shape, 2) * hit, weights.reshape(*shape, -1) * hit
     opacity = sums[..., 0]
-    distance = (sums[..., 1] / opacity.clamp(min=1e-8) + middle * (opacity > 0)) / canonical.stretch
+    distance = (sums[..., 1] / opacity.clamp(min=1e-8) + hits.middle * (opacity > 0)) / canonical.stretch
     return Rendering(rgb, opacity, distance, distance * rays.directions[..., 2], weights)
 
 
-def _hits(
-    cloud: GaussianCloud, canonical: CanonicalRays, config: SplattingConfig
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """alpha, t and number of each hit; t counts from the ray's point nearest the box's centre, `middle` away."""
-    splats = splats_seen(cloud, canonical) if config.widen else splats_of(cloud)
+@dataclass(frozen=True)
+class _Hits:
+    """Groups of rays and what they hit (number in `rgb`); t counts from the ray's point nearest the box's centre."""
+
+    alpha: Float[Tensor, "group ray hit"]
+    t: Float[Tensor, "group ray hit"]
+    index: Int[Tensor, "group ray hit"]
+    rgb: Float[Tensor, "group splat 3"]
+    middle: Float[Tensor, "batch all_rays"]
+
+
+def _hits(cloud: GaussianCloud, rays: Rays, canonical: CanonicalRays, config: SplattingConfig) -> _Hits:
+    splats = splats_seen(cloud, rays, canonical) if config.widen else splats_of(cloud)
     directions = canonical.view_directions
     middle = -(canonical.origins * directions).sum(dim=-1)
     points = canonical.origins + middle[..., None] * directions
+    rgb = cloud.colour_from(canonical.origins.mean(dim=1))
     if config.is_reference:
-        alpha, t, index = sorted_responses(splats, points, directions, -middle)
-    else:
-        alpha, t, index = ray_hits(splats, points, directions, -middle, most=config.most)
-    return alpha * canonical.hit[..., None], t, index, middle
+        return _Hits(*sorted_responses(splats, points, directions, -middle), rgb, middle)
+    met = encounter(splats, rgb, points, directions, -middle)
+    alpha, t, index = hits_of_features(met.coefficients, met.opacity, met.features, met.nearest, most=config.most)
+    return _Hits(alpha, t, index, met.rgb, middle)
 
 
-def splats_seen(cloud: GaussianCloud, canonical: CanonicalRays) -> Splats:
+def splats_seen(cloud: GaussianCloud, rays: Rays, canonical: CanonicalRays) -> Splats:
     """Splats as wide as the rays' cones at them make them.
 
-    One camera per batch entry is assumed here: the mean of the rays' origins and radii stands for all.
+    A pixel's cone has a radius proportional to depth (camera z), the same for all pixels of a pinhole camera; where the
+    cameras of a batch entry differ, the mean stands for all.
     """
     eye = canonical.origins.mean(dim=1)
-    metric = (cloud.mean - eye[:, None]) @ torch.linalg.inv(canonical.linear).mT
-    radius = canonical.radii.mean(dim=1)[:, None] * metric.norm(dim=-1)
-    footprint = footprint_variance(radius, canonical.linear)
-    return widened_splats(cloud, eye, footprint)
+    depth = ((cloud.mean - eye[:, None]) @ torch.linalg.inv(canonical.linear).mT)[..., 2]
+    radius_at_one = (rays.radii / rays.directions[..., 2].clamp(min=1e-3)).mean(dim=1)
+    return widened_splats(cloud, eye, footprint_variance(radius_at_one[:, None] * depth, canonical.linear))
 
 
 def footprint_variance(

@@ -1,0 +1,92 @@
+"""Leaving out early what a whole tile of rays misses, so that cost grows slower than the number of Gaussians.
+
+Rays that follow each other (the 16 of a 4 x 4 tile) are met as one thick ray first: with every Gaussian's reach grown
+by the tile's radius, what the middle ray misses all of them miss. Only the rest is tried ray by ray.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from carstudio.rendering.gaussians.cloud import Splats, invert_symmetric
+from carstudio.rendering.gaussians.hits import ray_features, reach_limit, splat_coefficients
+
+TILE_PX = 4
+TILE = TILE_PX**2  # rays that are tried together
+COHERENT = 0.7  # canonical radius up to which a group of rays is a tile; scattered rays are tried one by one
+_INSIDE = 1.75  # canonical units from the middle of a ray to where it leaves the box, at most sqrt(3)
+_SHARE = 0.5  # of the outer ellipsoid: (1 + a) Sigma + (1 + 1 / a) r^2 / limit holds ellipsoid plus ball for any a > 0
+
+
+@dataclass(frozen=True)
+class Encounter:
+    """Groups of rays and the Gaussians each of them may meet, as products take them (`hits`), with their colours."""
+
+    coefficients: Float[Tensor, "group 10 splat"]
+    opacity: Float[Tensor, "group splat"]
+    rgb: Float[Tensor, "group splat 3"]
+    features: Float[Tensor, "group ray 25"]
+    nearest: Float[Tensor, "group ray"]
+
+
+def encounter(
+    splats: Splats,
+    rgb: Float[Tensor, "batch splat 3"],
+    points: Float[Tensor, "batch ray 3"],
+    directions: Float[Tensor, "batch ray 3"],
+    nearest: Float[Tensor, "batch ray"],
+) -> Encounter:
+    """By tiles where the rays come in tiles that lie together; else every ray of a batch entry with every Gaussian."""
+    coefficients = splat_coefficients(splats)
+    features = torch.cat(ray_features(points, directions), dim=-1)
+    whole = Encounter(coefficients, splats.opacity, rgb, features, nearest)
+    if points.shape[1] % TILE:
+        return whole
+    with torch.no_grad():
+        tiles = (points.unflatten(1, (-1, TILE)).flatten(0, 1), directions.unflatten(1, (-1, TILE)).flatten(0, 1))
+        middle, toward, radius = tile_radius(*tiles)
+        if float(radius) > COHERENT:
+            return whole
+        candidates, is_met = _candidates(splats, middle, toward, radius, len(points))
+    entry = torch.arange(len(candidates), device=points.device) // (points.shape[1] // TILE)
+    flat = (candidates + entry[:, None] * rgb.shape[1]).flatten()
+    table = torch.cat([coefficients.mT, splats.opacity[..., None], rgb], dim=-1).flatten(0, 1)
+    taken = table.index_select(0, flat).unflatten(0, candidates.shape)
+    return Encounter(
+        taken[..., :10].mT.contiguous(),
+        taken[..., 10] * is_met,
+        taken[..., 11:],
+        features.unflatten(1, (-1, TILE)).flatten(0, 1),
+        nearest.unflatten(1, (-1, TILE)).flatten(0, 1),
+    )
+
+
+def tile_radius(
+    points: Float[Tensor, "tile ray 3"], directions: Float[Tensor, "tile ray 3"]
+) -> tuple[Float[Tensor, "tile 1 3"], Float[Tensor, "tile 1 3"], Float[Tensor, ""]]:
+    """Middle point and direction of each tile, and how far its rays stray from that middle ray inside the box."""
+    point = points.mean(dim=1, keepdim=True)
+    direction = torch.nn.functional.normalize(directions.mean(dim=1, keepdim=True), dim=-1)
+    stray = (points - point).norm(dim=-1) + _INSIDE * (directions - direction).norm(dim=-1)
+    return point, direction, stray.max()
+
+
+def _candidates(
+    splats: Splats, middle: Tensor, toward: Tensor, radius: Tensor, batch: int
+) -> tuple[Int[Tensor, "tile candidate"], Float[Tensor, "tile candidate"]]:
+    """Numbers of the Gaussians that each tile may meet, as many for each as the fullest needs, and 1 where it does."""
+    limit = reach_limit(splats.opacity).clamp(min=1e-3)
+    covariance, _ = invert_symmetric(splats.precision)
+    ball = (1 + 1 / _SHARE) * radius**2 / limit
+    eye = torch.eye(3, dtype=covariance.dtype, device=covariance.device)
+    outer, _ = invert_symmetric((1 + _SHARE) * covariance + ball[..., None, None] * eye)
+    coefficients = splat_coefficients(Splats(splats.mean, outer, splats.opacity))
+    features = ray_features(*(rays.view(batch, -1, 3) for rays in (middle, toward)))
+    c, b, e = (part @ coefficients[:, : part.shape[-1]] for part in features)
+    over = (c - b * b / e - reach_limit(splats.opacity)[:, None]).flatten(0, 1)
+    is_met = over < 0
+    width = max(1, int(is_met.sum(dim=-1).max()))
+    met, candidates = is_met.to(torch.uint8).topk(width, dim=-1)
+    return candidates, met.to(over.dtype)
