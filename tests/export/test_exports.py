@@ -46,7 +46,8 @@ def cloud() -> GaussianCloud:
         log_scale=torch.rand(1, 40, 3, generator=generator) * 1.5 - 3.5,
         quaternion=torch.nn.functional.normalize(torch.randn(1, 40, 4, generator=generator), dim=-1),
         opacity=torch.rand(1, 40, generator=generator) * 0.9 + 0.05,
-        rgb=torch.rand(1, 40, 3, generator=generator),
+        rgb=torch.rand(1, 40, 3, generator=generator) * 0.6 + 0.2,
+        tint=torch.randn(1, 40, 3, 3, generator=generator) * 0.1,
     )
 
 
@@ -73,8 +74,9 @@ def test_the_file_is_what_splat_viewers_expect(tmp_path: Path, cloud: GaussianCl
     head, _, body = (tmp_path / "car.ply").read_bytes().partition(b"end_header\n")
     names = [line.split()[-1].decode() for line in head.split(b"\n") if line.startswith(b"property float")]
     assert names[:9] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
-    assert names[9:] == ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    row = dict(zip(names, struct.unpack("<17f", body[: 17 * 4]), strict=True))
+    assert names[9:17] == ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+    assert names[17:] == [f"f_rest_{i}" for i in range(45)]
+    row = dict(zip(names, struct.unpack("<62f", body[: 62 * 4]), strict=True))
     mean, half = cloud.mean[0, 0].numpy(), SIZE.numpy() / 2
     expected = [mean[2] * half[2], -mean[1] * half[1] + half[1], mean[0] * half[0]]
     np.testing.assert_allclose([row["x"], row["y"], row["z"]], expected, rtol=1e-5)
@@ -85,6 +87,29 @@ def test_the_file_is_what_splat_viewers_expect(tmp_path: Path, cloud: GaussianCl
     covariance = turn @ np.diag(np.exp([2 * row[f"scale_{i}"] for i in range(3)])) @ turn.T
     linear = gltf_from_canonical(SIZE)[0].numpy()
     np.testing.assert_allclose(covariance, linear @ cloud.covariance()[0, 0].numpy() @ linear.T, rtol=1e-3, atol=1e-6)
+
+
+def test_tinted_colours_as_viewers_compute_them(tmp_path: Path, cloud: GaussianCloud) -> None:
+    """Harmonics of degree 1 written out (basis -y, z, -x), against our colour for a camera far away."""
+    write_ply(tmp_path / "car.ply", metric_splats(cloud, SIZE))
+    head, _, body = (tmp_path / "car.ply").read_bytes().partition(b"end_header\n")
+    names = [line.split()[-1].decode() for line in head.split(b"\n") if line.startswith(b"property float")]
+    table = np.frombuffer(body, "<f4").reshape(40, len(names))
+    linear = gltf_from_canonical(SIZE)[0]
+    errors = []
+    for direction in ([0.6, 0.0, 0.8], [-0.5, -0.3, 0.6], [0.1, -0.2, -0.9]):
+        x, y, z = (np.array(direction) / np.linalg.norm(direction)).tolist()
+        basis = [0.28209479, -0.48860251 * y, 0.48860251 * z, -0.48860251 * x]
+        seen = []
+        for channel in range(3):
+            terms = [f"f_dc_{channel}", *(f"f_rest_{15 * channel + term}" for term in range(3))]
+            seen.append(sum(b * table[:, names.index(term)] for b, term in zip(basis, terms, strict=True)) + 0.5)
+        eye = -100 * torch.linalg.inv(linear) @ torch.tensor([x, y, z])
+        ours = cloud.colour_from(eye[None])[0].numpy()
+        errors.append(np.abs(np.clip(np.stack(seen, axis=1), 0, 1) - ours).max())
+        flat = np.abs(cloud.rgb[0].numpy() - ours).max()
+        assert errors[-1] < 0.5 * flat  # the tint is there, and the right way round
+    assert max(errors) < 0.12  # degree 1 is not the whole of it
 
 
 def test_other_files_are_refused(tmp_path: Path, cloud: GaussianCloud) -> None:
