@@ -129,6 +129,20 @@ def test_the_verb_writes_a_car_that_opens_with_its_model_alone(
     model, again = open_car(tmp_path / "car", trained)
     assert torch.equal(again.latents.shape, car.latents.shape)
     assert torch.equal(model.state_dict()["field.density.weight"], car.weights["field.density.weight"])
+    turn = ["render", str(tmp_path / "car"), "--run-of-car", str(trained), "--out", str(tmp_path / "turn")]
+    assert run([*turn, "--views", "2", "--size", "24", "--device", "cpu"]) == 0
+    assert {path.name for path in (tmp_path / "turn").iterdir()} == {
+        "rgb",
+        "opacity",
+        "depth",
+        "turntable.gif",
+        "turntable.mp4",
+    }
+    assert run(["export", str(tmp_path / "car"), "--format", "ply", "--out", str(tmp_path / "c.ply")]) == 2
+    assert "made with the model tiny" in capsys.readouterr().err
+    export = ["export", str(tmp_path / "car"), "--model", str(trained)]
+    assert run([*export, "--format", "ply", "--out", str(tmp_path / "c.ply")]) == 2
+    assert "tiny is not made of Gaussians; take --format glb" in capsys.readouterr().err
     other = tmp_path / "other"
     train(TINY.__class__(**{**vars(TINY), "seed": 1, "steps": 1}), store, other, device="cpu")
     with pytest.raises(InputError, match=r"not the model that .* was made with"):

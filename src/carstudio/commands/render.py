@@ -1,32 +1,39 @@
-"""`carstudio render`: a trained model and input photos -> turntables, opacity and depth."""
+"""`carstudio render`: a car, or a trained model and input photos -> turntables, opacity and depth."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 import tyro
 
 from carstudio.commands.command import Outcome, Output
+from carstudio.commands.opening import open_car
 from carstudio.dataset.store import PatchStore, open_store
 from carstudio.devices import pick_device
 from carstudio.errors import InputError
 from carstudio.files import inside
+from carstudio.fitting.car_file import DESCRIPTION
+from carstudio.geometry.box3d import Box3D
 from carstudio.images import write_png
-from carstudio.report.panels import encode_patch, turntable
+from carstudio.models.interface import Latents
+from carstudio.report.panels import Turntable, encode_patch, turntable
 from carstudio.report.video import write_gif, write_mp4
 from carstudio.training.checkpoint import load_model
 
 
 @dataclass(frozen=True, kw_only=True)
 class Render(Output):
-    """Novel views of cars: encode one photo each, then go round the car."""
+    """Novel views of cars: a fitted car, or one photo each encoded by a model; then round the car."""
 
     model: tyro.conf.Positional[Path]
-    """Folder of the run."""
-    data: Path
-    """The CarPatch3D store with the input photos."""
+    """Folder of a car (`carstudio fit`) or of a run, or the name of a bundled model."""
+    data: Path | None = None
+    """Of a run: the CarPatch3D store with the input photos."""
     out: Path
-    """One folder per car: input.png, rgb/ opacity/ depth/, turntable.gif, turntable.mp4."""
+    """One folder per car: input.png (of a run), rgb/ opacity/ depth/, turntable.gif, turntable.mp4."""
+    run_of_car: tyro.conf.OmitArgPrefixes[Path | None] = None
+    """Of a car: the run it was made with; the bundled model of that name when absent."""
     patches: tuple[str, ...] = ()
     """Patch ids to encode; the first view of --cars unseen cars when absent."""
     cars: int = 4
@@ -50,6 +57,10 @@ class Render(Output):
         """Render and write."""
         if self.views < 1 or not 8 <= self.size <= 4096:
             raise InputError(f"--views must be at least 1 and --size 8 to 4096, found {self.views} and {self.size}")
+        if (self.model / DESCRIPTION).exists():
+            return self._render_car()
+        if self.data is None:
+            raise InputError("--data STORE is needed: a run shows cars that it encodes from a store's photos")
         model = load_model(self.model, device=pick_device(self.device))
         store = open_store(self.data)
         patch_ids = self.patches or tuple(self._first_views(store))
@@ -61,15 +72,21 @@ class Render(Output):
                 )
                 folder = inside(self.out, patch_id)  # the id may come from a store that another program wrote
                 write_png(folder / "input.png", prepared.rgb.numpy())
-                for name in ("rgb", "opacity", "depth"):
-                    for i, frame in enumerate(getattr(frames, name)):
-                        write_png(folder / name / f"{i:03d}.png", frame)
-                rows = zip(frames.rgb, frames.opacity, frames.depth, strict=True)
-                joined = [np.concatenate(row, axis=1) for row in rows]
-                write_gif(folder / "turntable.gif", joined, fps=12.0)
-                write_mp4(folder / "turntable.mp4", joined, fps=12.0)
+                write_turntable(folder, frames)
                 report("rendering", done, len(patch_ids), patch_id)
         return Outcome(f"{len(patch_ids)} cars in {self.out}", {"cars": list(patch_ids), "out": str(self.out)})
+
+    def _render_car(self) -> Outcome:
+        model, car = open_car(self.model, self.run_of_car)
+        device = pick_device(self.device)
+        latents = Latents(car.latents.shape.to(device), car.latents.texture.to(device))
+        size = torch.tensor([car.size], device=device)
+        box = Box3D(torch.zeros(1, 3, device=device), size, torch.eye(3, device=device)[None])
+        frames = turntable(
+            model.to(device), latents, box, views=self.views, size_px=self.size, elevation_deg=self.elevation
+        )
+        write_turntable(self.out, frames)
+        return Outcome(f"{car.instance_id} in {self.out}", {"cars": [car.instance_id], "out": str(self.out)})
 
     def _first_views(self, store: PatchStore) -> list[str]:
         ids = store.patch_ids(kept=True, split=self.split, part="test")
@@ -81,3 +98,13 @@ class Render(Output):
         if not first:
             raise InputError(f"{self.data}: no kept patch in the test part of split {self.split!r}; name --patches")
         return list(first.values())[: self.cars]
+
+
+def write_turntable(folder: Path, frames: Turntable) -> None:
+    """Every frame of colour, opacity and depth, and all of them side by side as moving pictures."""
+    for name in ("rgb", "opacity", "depth"):
+        for i, frame in enumerate(getattr(frames, name)):
+            write_png(folder / name / f"{i:03d}.png", frame)
+    joined = [np.concatenate(row, axis=1) for row in zip(frames.rgb, frames.opacity, frames.depth, strict=True)]
+    write_gif(folder / "turntable.gif", joined, fps=12.0)
+    write_mp4(folder / "turntable.mp4", joined, fps=12.0)
