@@ -126,7 +126,7 @@ def test_the_fast_path_has_the_gradients_of_its_values() -> None:
 @pytest.mark.parametrize("make", [random_cloud, surface_cloud])
 @pytest.mark.parametrize("chunk", [2**9, 2**17])
 def test_the_fast_path_equals_the_plain_one(make, chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """float32 against float64. Left out are alphas below 1/512: a step of 8 bit in a pixel, 2e-4 on the whole."""
+    """float32 against float64; a hit that is just too faint for one of the two makes the largest differences."""
     monkeypatch.setitem(hits._CHUNK, "cpu", chunk)
     weights = torch.randn(1, 32 * 32, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     results = []
@@ -137,14 +137,14 @@ def test_the_fast_path_equals_the_plain_one(make, chunk: int, monkeypatch: pytes
         loss = loss + (found.depth_m * (found.opacity.detach() > 0.5)).sum()
         results.append((found, torch.autograd.grad(loss, parts)))
     (plain, plain_gradients), (fast, fast_gradients) = results
-    for name, worst, mean in (("rgb", 1.5e-2, 5e-4), ("opacity", 1.5e-2, 5e-4)):
+    for name, worst, mean in (("rgb", 5e-3, 1e-5), ("opacity", 5e-3, 1e-5)):
         error = (getattr(plain, name) - getattr(fast, name)).abs()
         assert float(error.max()) < worst, name
         assert float(error.mean()) < mean, name
     solid = plain.opacity > 0.5
-    assert float((plain.depth_m - fast.depth_m)[solid].abs().max()) < 0.03
+    assert float((plain.depth_m - fast.depth_m)[solid].abs().max()) < 0.01
     for plain_gradient, fast_gradient in zip(plain_gradients, fast_gradients, strict=True):
-        assert float((plain_gradient - fast_gradient).norm() / plain_gradient.norm()) < 0.05
+        assert float((plain_gradient - fast_gradient).norm() / plain_gradient.norm()) < 2e-3
 
 
 @pytest.mark.parametrize("make", [random_cloud, surface_cloud])
