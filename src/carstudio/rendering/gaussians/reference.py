@@ -34,7 +34,7 @@ def sorted_responses(
     directions: Float[Tensor, "batch ray 3"],
     nearest: Float[Tensor, "batch ray"],
 ) -> tuple[Float[Tensor, "batch ray splat"], Float[Tensor, "batch ray splat"], Tensor]:
-    """alpha, t of the peak, number of each Gaussian from front to back; alpha is 0 where too faint or t <= `nearest`."""
+    """alpha, t of the peak and number from front to back; alpha is 0 where too faint or t <= `nearest`."""
     alpha, t = responses(splats, points, directions)
     alpha = alpha * ((t > nearest[..., None]) & (alpha >= FAINTEST))
     t, order = t.sort(dim=-1)
