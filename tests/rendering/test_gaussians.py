@@ -281,7 +281,7 @@ def test_mirroring_negates_z_of_the_covariance() -> None:
 
 def test_widened_gaussians_look_like_the_mean_over_the_pixel() -> None:
     """A 12-pixel picture of thin discs against the mean of a 15 times finer one, with and without widening."""
-    cloud, box = surface_cloud(1200), car_box(distance_m=20.0)
+    cloud, box = surface_cloud(2000), car_box(distance_m=20.0)
     coarse, fine = camera(12), camera(12).resize(180, 180)
     truth = picture(cloud, box, fine, replace(FAST, widen=False)).rgb.reshape(12, 15, 12, 15, 3).mean(dim=(1, 3))
     errors = [
