@@ -9,14 +9,13 @@ import torch
 from carstudio.dataset.store import PatchStore
 from carstudio.errors import InputError
 from carstudio.evaluation.protocols import EvaluationConfig, score_views, view_pairs
-from carstudio.geometry.box3d import Box3D, mirror_box
+from carstudio.geometry.box3d import Box3D
 from carstudio.geometry.camera import Camera
 from carstudio.geometry.orbit import orbit_box, orbit_camera
 from carstudio.models.car_gaussians import CarGaussians, CarGaussiansConfig
 from carstudio.models.encoders import EncoderConfig
 from carstudio.models.gaussian_template import EXTENT, surface_template
 from carstudio.models.interface import CategoryModel, Latents, PatchBatch, render_image, window_of
-from carstudio.models.photo_features import in_front, photo_at
 from carstudio.models.zoo import config_from_json, config_to_json
 from carstudio.recipes import RECIPES, recipe
 from carstudio.rendering.rays import image_rays, to_canonical
@@ -28,7 +27,6 @@ from training.toy import TINY, toy_store
 SMALL = CarGaussiansConfig(
     encoder=EncoderConfig(kind="small", side_px=32, pretrained=None, num_features=32, sees_mask=True),
     num_splats=64,
-    sees_photo=True,
     code_size=16,
     width=32,
     tint_width=8,
@@ -116,43 +114,6 @@ def test_the_template_covers_the_box_on_both_sides() -> None:
         assert float(template.mean.abs().max()) <= EXTENT + 1e-6
         assert float(template.mean.abs().amax(dim=-1).min()) > 0.6  # on the surface, not inside
         assert bool((template.mean[:, 2] > 0).all()) is is_half
-
-
-def test_the_photo_is_looked_up_where_the_point_is_seen() -> None:
-    """A photo whose red is the column and whose green is the row, against projecting by hand."""
-    patches = batch()
-    column, row = torch.meshgrid(torch.arange(32.0) + 0.5, torch.arange(32.0) + 0.5, indexing="xy")
-    image = torch.stack([column / 32, row / 32, torch.zeros(32, 32)])[None]
-    patches = PatchBatch(image, torch.ones(1, 32, 32), patches.camera, patches.box, patches.instance_ids)
-    point = torch.tensor([[[0.5, -0.3, 0.4]]])
-    in_camera = (point[0] * patches.box.size / 2) @ patches.box.rotation[0].mT + patches.box.center
-    expected = patches.camera.project(in_camera[None])[0, 0] / 32
-    found = photo_at(point, patches)[0, 0]
-    assert torch.allclose(found[:2] / found[3], expected, atol=1e-4)
-    assert float(found[3]) > 0.95
-    hidden = PatchBatch(image, torch.zeros(1, 32, 32), patches.camera, patches.box, patches.instance_ids)
-    assert float(photo_at(point, hidden).abs().max()) < 1e-6  # outside of the mask there is no car to see
-
-
-def test_what_stands_behind_is_not_seen() -> None:
-    position = torch.tensor([[[0.51, 0.51], [0.52, 0.52], [0.9, 0.1]]])
-    found = in_front(position, torch.tensor([[8.0, 10.0, 10.0]]), torch.tensor([[0.25]]))
-    assert float(found[0, 0]) > 0.95
-    assert float(found[0, 1]) < 0.01
-    assert float(found[0, 2]) > 0.95
-
-
-@torch.no_grad()
-def test_a_mirrored_photo_looks_up_mirrored_colours() -> None:
-    patches = batch()
-    flipped = PatchBatch(
-        patches.image.flip(3), patches.mask.flip(2), patches.camera.flip(), mirror_box(patches.box), ("a",)
-    )
-    points = torch.rand(1, 50, 3, generator=torch.Generator().manual_seed(0)) * 1.6 - 0.8
-    straight = photo_at(points, patches)
-    mirrored = photo_at(points * torch.tensor([1.0, 1.0, -1.0]), flipped)
-    # cells of the depth buffer are cut alike: 20 of them over the photo, mirrored onto each other
-    assert torch.allclose(straight, mirrored, atol=1e-4)
 
 
 TOY = dataclasses.replace(TINY, recipe="toy-gaussians", model=SMALL, mirroring="apart", rays_per_patch=128)

@@ -9,58 +9,22 @@ from torch import Tensor
 from carstudio.geometry.box3d import Box3D, mirror_box
 from carstudio.geometry.camera import Camera
 from carstudio.geometry.canonical import canonical_from_camera
-from carstudio.geometry.orbit import orbit_box, orbit_camera
 from carstudio.geometry.transforms import rotation_from_quaternion
-from carstudio.models.gaussian_template import surface_template
-from carstudio.models.interface import _tiles_that_hit
-from carstudio.rendering.gaussians import hits, tiles
+from carstudio.rendering.gaussians import hits
 from carstudio.rendering.gaussians.cloud import GaussianCloud, Splats, invert_symmetric, splats_of, widened_splats
 from carstudio.rendering.gaussians.reference import MAX_ALPHA, responses, sorted_responses
 from carstudio.rendering.gaussians.tracing import SplattingConfig, render_cloud, trace_cloud
 from carstudio.rendering.rays import Rays, image_rays, to_canonical
 from carstudio.rendering.volume import Rendering, composite, merge_segments
+from rendering.gaussian_scenes import camera, car_box, leaves, random_cloud, surface_cloud
 from rendering.scenes import batched, kitti_camera, positions_on_box, tilted_box
 
 FAST, REFERENCE = SplattingConfig(most=200), SplattingConfig(is_reference=True)
 
 
-def random_cloud(count: int = 60, dtype: torch.dtype = torch.float64, seed: int = 0) -> GaussianCloud:
-    generator = torch.Generator().manual_seed(seed)
-    draw = torch.rand(1, count, 14, generator=generator, dtype=torch.float64).to(dtype)
-    quaternion = draw[..., 6:10] * 2 - 1
-    return GaussianCloud(
-        draw[..., :3] * 1.6 - 0.8, (draw[..., 3:6] * 0.2 + 0.03).log(), quaternion, draw[..., 10], draw[..., 11:]
-    )
-
-
-def surface_cloud(count: int = 400, dtype: torch.dtype = torch.float64) -> GaussianCloud:
-    """Like a trained car: nearly opaque thin discs on a closed surface."""
-    template = surface_template(count, is_half=False)
-    colours = torch.rand(1, count, 3, generator=torch.Generator().manual_seed(3))
-    parts = template.mean[None], template.log_scale[None], template.quaternion[None], torch.full((1, count), 0.95)
-    return GaussianCloud(*(part.to(dtype) for part in (*parts, colours)))
-
-
-def car_box(
-    dtype: torch.dtype = torch.float64, azimuth_deg: float = 35.0, distance_m: float = 9.0, elevation_deg: float = 10.0
-) -> Box3D:
-    box = orbit_box(
-        torch.tensor([4.2, 1.55, 1.8]), azimuth_deg=azimuth_deg, elevation_deg=elevation_deg, distance_m=distance_m
-    )
-    return Box3D(box.center[None].to(dtype), box.size[None].to(dtype), box.rotation[None].to(dtype))
-
-
-def camera(side: int, dtype: torch.dtype = torch.float64) -> Camera:
-    return Camera(orbit_camera(side).intrinsics.to(dtype), side, side)
-
-
 def picture(cloud: GaussianCloud, box: Box3D, view: Camera, config: SplattingConfig = REFERENCE) -> Rendering:
     rays = image_rays(view)
     return composite(trace_cloud(cloud, rays, to_canonical(rays, box), config))
-
-
-def leaves(cloud: GaussianCloud) -> list[Tensor]:
-    return [value.clone().requires_grad_() for value in list(vars(cloud).values())[:5]]
 
 
 def test_peaks_are_the_maxima_along_the_ray() -> None:
@@ -126,7 +90,7 @@ def test_the_fast_path_has_the_gradients_of_its_values() -> None:
 @pytest.mark.parametrize("make", [random_cloud, surface_cloud])
 @pytest.mark.parametrize("chunk", [2**9, 2**17])
 def test_the_fast_path_equals_the_plain_one(make, chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """float32 against float64. Left out are alphas below 1/512: a step of 8 bit in a pixel, 2e-4 on the whole."""
+    """float32 against float64; a hit that is just too faint for one of the two makes the largest differences."""
     monkeypatch.setitem(hits._CHUNK, "cpu", chunk)
     weights = torch.randn(1, 32 * 32, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     results = []
@@ -137,14 +101,14 @@ def test_the_fast_path_equals_the_plain_one(make, chunk: int, monkeypatch: pytes
         loss = loss + (found.depth_m * (found.opacity.detach() > 0.5)).sum()
         results.append((found, torch.autograd.grad(loss, parts)))
     (plain, plain_gradients), (fast, fast_gradients) = results
-    for name, worst, mean in (("rgb", 1.5e-2, 5e-4), ("opacity", 1.5e-2, 5e-4)):
-        error = (getattr(plain, name) - getattr(fast, name)).abs()
+    for name, worst, mean in (("rgb", 5e-3, 1e-5), ("opacity", 5e-3, 1e-5)):
+        error = (getattr(plain, name) - getattr(fast, name)).detach().abs()
         assert float(error.max()) < worst, name
         assert float(error.mean()) < mean, name
     solid = plain.opacity > 0.5
-    assert float((plain.depth_m - fast.depth_m)[solid].abs().max()) < 0.03
+    assert float((plain.depth_m - fast.depth_m).detach()[solid].abs().max()) < 0.01
     for plain_gradient, fast_gradient in zip(plain_gradients, fast_gradients, strict=True):
-        assert float((plain_gradient - fast_gradient).norm() / plain_gradient.norm()) < 0.05
+        assert float((plain_gradient - fast_gradient).norm() / plain_gradient.norm()) < 2e-3
 
 
 @pytest.mark.parametrize("make", [random_cloud, surface_cloud])
@@ -280,10 +244,10 @@ def test_mirroring_negates_z_of_the_covariance() -> None:
 
 
 def test_widened_gaussians_look_like_the_mean_over_the_pixel() -> None:
-    """A 12-pixel picture of thin discs against the mean of a 25 times finer one, with and without widening."""
+    """A 12-pixel picture of thin discs against the mean of a 15 times finer one, with and without widening."""
     cloud, box = surface_cloud(2000), car_box(distance_m=20.0)
-    coarse, fine = camera(12), camera(12).resize(300, 300)
-    truth = picture(cloud, box, fine, replace(FAST, widen=False)).rgb.reshape(12, 25, 12, 25, 3).mean(dim=(1, 3))
+    coarse, fine = camera(12), camera(12).resize(180, 180)
+    truth = picture(cloud, box, fine, replace(FAST, widen=False)).rgb.reshape(12, 15, 12, 15, 3).mean(dim=(1, 3))
     errors = [
         float((picture(cloud, box, coarse, replace(FAST, widen=widen)).rgb.reshape(12, 12, 3) - truth).abs().mean())
         for widen in (False, True)
@@ -333,56 +297,3 @@ def test_a_gaussian_behind_the_camera_is_not_seen() -> None:
                 one_gaussian((x, 0.0, 0.0), (1.0, 1.0, 1.0), 0.1), box, camera(3), replace(config, widen=False)
             )
             assert (float(found.opacity[0, 4]) > 0.9) is seen
-
-
-def tile_rays(side: int, dtype: torch.dtype = torch.float64) -> Rays:
-    """Rays of an image in the order of 4 x 4 tiles."""
-    pixels = _tiles_that_hit(torch.ones(side, side, dtype=torch.bool), tiles.TILE_PX)
-    return image_rays(camera(side, dtype)).select(pixels)
-
-
-@pytest.mark.parametrize("make", [random_cloud, surface_cloud])
-def test_tiles_leave_out_nothing_that_is_met(make, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By tiles and ray by ray: the same alphas, distances and gradients."""
-    rays, results = tile_rays(48), []
-    canonical = to_canonical(rays, car_box())
-    for coherent in (0.7, 0.0):
-        monkeypatch.setattr(tiles, "COHERENT", coherent)
-        parts = leaves(make())
-        found = trace_cloud(GaussianCloud(*parts), rays, canonical, SplattingConfig(most=400))
-        width = found.alpha.shape[-1]
-        loss = (composite(found).rgb * torch.linspace(0, 1, 3)).sum()
-        results.append((found, width, torch.autograd.grad(loss, parts)))
-    (tiled, few, tiled_gradients), (whole, many, whole_gradients) = results
-    assert few < many, "tiles left nothing out"
-    # peaks closer than the keys tell apart (a micrometre or two) may change places
-    error = (tiled.alpha.sort().values - whole.alpha.sort().values[..., -few:]).abs()
-    assert float(error.max()) < 1.001 * hits.FAINTEST  # of those that are just worth showing
-    assert float(error.mean()) < 1e-7
-    assert float(whole.alpha[..., few:].max()) == 0.0
-    lit = tiled.alpha > 0
-    assert torch.allclose(tiled.distance_m[lit], whole.distance_m[..., :few][lit], atol=2e-5)
-    for a, b in zip(tiled_gradients, whole_gradients, strict=True):
-        assert float((a - b).norm()) < 1e-3 * float(a.norm())
-
-
-def test_scattered_rays_are_no_tiles() -> None:
-    rays = image_rays(camera(32))
-    order = torch.randperm(1024, generator=torch.Generator().manual_seed(0))
-    canonical, splats = to_canonical(rays.select(order), car_box()), splats_of(surface_cloud())
-    points = torch.zeros_like(canonical.origins)
-    met = tiles.encounter(splats, surface_cloud().rgb, points, canonical.view_directions, canonical.near)
-    assert met.opacity.shape == (1, 400)
-    assert met.features.shape == (1, 1024, 25)
-
-
-@pytest.mark.parametrize(("height", "width"), [(8, 8), (7, 10), (1, 1), (4, 13)])
-@pytest.mark.parametrize("side", [1, 4])
-def test_touched_tiles_cover_all_hits_tile_by_tile(height: int, width: int, side: int) -> None:
-    hit = torch.rand(height, width, generator=torch.Generator().manual_seed(height)) < 0.3
-    pixels = _tiles_that_hit(hit, side).unflatten(0, (-1, side * side))
-    assert set(hit.flatten().nonzero().flatten().tolist()) <= set(pixels.flatten().tolist())
-    for tile in pixels.tolist():
-        places = {(pixel // width // side, pixel % width // side) for pixel in tile}
-        assert len(places) == 1
-        assert any(bool(hit.flatten()[pixel]) for pixel in tile)

@@ -15,7 +15,6 @@ from carstudio.models.encoders import EncoderConfig, build_encoder, load_imagene
 from carstudio.models.gaussian_template import surface_template
 from carstudio.models.interface import CategoryModel, Latents, PatchBatch
 from carstudio.models.patch_features import POSE_FEATURES, pose_features, tiny_masked_copy
-from carstudio.models.photo_features import PHOTO_FEATURES, photo_at
 from carstudio.rendering.gaussians.cloud import GaussianCloud
 from carstudio.rendering.gaussians.tiles import TILE_PX
 from carstudio.rendering.gaussians.tracing import SplattingConfig, render_cloud, trace_cloud
@@ -45,15 +44,9 @@ class CarGaussiansConfig:
     """Gaussians come in pairs mirrored in the car's middle plane; colours are free."""
     colour_skip_px: int = 8
     """Side of a tiny copy of the masked crop, added to the texture code by a linear map; 0: none."""
-    sees_photo: bool = False
-    """Look up each Gaussian's place (and its mirror image's) in the photo; the findings lengthen the texture code."""
     tint_width: int = 64
     """Rank of the colours' change with the line of sight (spherical harmonics of degree 1); 0: colours are the same
     from everywhere."""
-    kin_size: int = 16
-    """Length of the embeddings whose products say how much one Gaussian's colour tells about another's."""
-    kin_heads: int = 2
-    """Kinds of such kinship."""
     least_scale: float = 0.01
     """Smallest standard deviation of a Gaussian, canonical units."""
     largest_scale: float = 0.5
@@ -95,11 +88,6 @@ class CarGaussians(CategoryModel):
         if self.config.colour_skip_px:
             texture = texture + self.colour_skip(tiny_masked_copy(patches, self.config.colour_skip_px))
         shape, texture = self.shape_norm(self.shape_head(features)), self.texture_norm(texture)
-        if self.config.sees_photo:
-            with torch.no_grad(), torch.autocast(patches.image.device.type, enabled=False):
-                mean = self.geometry(shape.to(patches.image.dtype))[0]
-                photo = photo_at(mean, patches).flatten(1).to(texture.dtype)
-            texture = torch.cat([texture, photo], dim=-1)
         return Latents(shape, texture)
 
     def decode(self, latents: Latents) -> GaussianCloud:
@@ -177,19 +165,13 @@ class GeometryDecoder(nn.Module):
 
 
 class ColourDecoder(nn.Module):
-    """Texture code (and the detached shape code) to a colour per Gaussian.
-
-    Where the photo was looked up, what it shows differently from what the code says spreads from seen Gaussians to
-    related ones (`ResidualSpread`).
-    """
+    """Texture code (and the detached shape code) to a colour per Gaussian."""
 
     def __init__(self, config: CarGaussiansConfig) -> None:
         super().__init__()
         self.config = config
         self.hidden = nn.Sequential(nn.Linear(2 * config.code_size, config.width), nn.SiLU())
         self.colours = nn.Linear(config.width, config.num_splats * 3)
-        if config.sees_photo:
-            self.spread = ResidualSpread(config)
         if config.tint_width:
             last = nn.Linear(config.tint_width, config.num_splats * 9)
             nn.init.zeros_(last.weight)
@@ -200,38 +182,7 @@ class ColourDecoder(nn.Module):
         self, latents: Latents
     ) -> tuple[Float[Tensor, "batch splat 3"], Float[Tensor, "batch splat 3 3"] | None]:
         """Colours in [0, 1], and their change with the line of sight where the config asks for one."""
-        code = latents.texture[:, : self.config.code_size]
-        hidden = self.hidden(torch.cat([code, latents.shape.detach()], dim=-1))
+        hidden = self.hidden(torch.cat([latents.texture, latents.shape.detach()], dim=-1))
         colours = torch.sigmoid(self.colours(hidden).unflatten(-1, (-1, 3)))
         tint = self.tint(hidden).unflatten(-1, (-1, 3, 3)) if self.config.tint_width else None
-        if not self.config.sees_photo:
-            return colours, tint
-        photo = latents.texture[:, self.config.code_size :].unflatten(-1, (-1, PHOTO_FEATURES))
-        return (colours + self.spread(colours, photo)).clamp(0, 1), tint
-
-
-class ResidualSpread(nn.Module):
-    """How a surprise at one Gaussian tells on the others: learned kinship, the same for all cars.
-
-    r_h = photo - colour where Gaussian h is seen (visibility v_h); Gaussian g is corrected by the mean of r_h over its
-    kin, sum_h a_gh v_h r_h / (sum_h a_gh v_h + few), a = softmax(q k^T): paint learns from paint, wheels from wheels.
-    """
-
-    def __init__(self, config: CarGaussiansConfig) -> None:
-        super().__init__()
-        count, heads, size = config.num_splats, config.kin_heads, config.kin_size
-        self.query = nn.Parameter(torch.randn(heads, count, size) * 0.5)
-        self.key = nn.Parameter(torch.randn(heads, count, size) * 0.5)
-        self.trust = nn.Parameter(torch.full((heads, count, 1), 0.0))
-        self.few = 0.02
-
-    def forward(
-        self, colours: Float[Tensor, "batch splat 3"], photo: Float[Tensor, "batch splat 4"]
-    ) -> Float[Tensor, "batch splat 3"]:
-        """What to add to the colours."""
-        seen = photo[..., 3:]
-        values = torch.cat([photo[..., :3] - seen * colours, seen], dim=-1)
-        kinship = torch.softmax(self.query @ self.key.mT, dim=-1)
-        gathered = kinship @ values[:, None]
-        mean = gathered[..., :3] / (gathered[..., 3:] + self.few)
-        return (torch.sigmoid(self.trust) * mean).sum(dim=1)
+        return colours, tint

@@ -13,9 +13,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from carstudio.rendering.gaussians.cloud import Splats
-from carstudio.rendering.gaussians.reference import MAX_ALPHA
+from carstudio.rendering.gaussians.reference import FAINTEST, MAX_ALPHA
 
-FAINTEST = 1.0 / 512  # an alpha below it is nothing: half a step of an 8-bit image
 _CHUNK = {"cpu": 2**17, "other": 2**26}  # ray-splat pairs at a time: on a CPU some arrays of them fit the L2 cache
 _REACH = 4.0  # canonical units: farther from x than this along the ray no Gaussian of a box [-1, 1]^3 can peak
 

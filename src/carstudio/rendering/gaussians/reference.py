@@ -10,6 +10,7 @@ from torch import Tensor
 
 from carstudio.rendering.gaussians.cloud import Splats, quadratic
 
+FAINTEST = 1.0 / 256  # an alpha below it counts as 0, or every Gaussian would be on every ray
 MAX_ALPHA = 0.999  # of one Gaussian: some light comes through, so that gradients reach what lies behind
 
 
@@ -33,8 +34,8 @@ def sorted_responses(
     directions: Float[Tensor, "batch ray 3"],
     nearest: Float[Tensor, "batch ray"],
 ) -> tuple[Float[Tensor, "batch ray splat"], Float[Tensor, "batch ray splat"], Tensor]:
-    """alpha, t of the peak and number of every Gaussian from front to back; alpha is 0 for t <= `nearest`."""
+    """alpha, t of the peak and number from front to back; alpha is 0 where too faint or t <= `nearest`."""
     alpha, t = responses(splats, points, directions)
-    alpha = alpha * (t > nearest[..., None])
+    alpha = alpha * ((t > nearest[..., None]) & (alpha >= FAINTEST))
     t, order = t.sort(dim=-1)
     return torch.gather(alpha, -1, order), t, order
