@@ -12,6 +12,7 @@ from carstudio.dataset.sources.synthetic import SynthConfig, synthesize
 from carstudio.dataset.store import open_store
 from carstudio.errors import InputError
 from carstudio.evaluation.protocols import EvaluationConfig, score_views, view_pairs
+from carstudio.report.run_page import RunPageConfig, write_run_page
 from carstudio.training.bundled import bundled_models, find_model
 from carstudio.training.checkpoint import describe_model, load_model
 
@@ -59,3 +60,14 @@ def test_bundled_models_show_cars_they_never_saw(
     assert len(scores) >= 12
     assert np.mean([score.psnr for score in scores]) > least_psnr
     assert np.mean([score.mask_iou for score in scores]) > least_iou
+
+
+def test_a_bundled_model_has_its_report(tmp_path: Path) -> None:
+    """By its name, and without a learning curve: its log is not in the package."""
+    synthesize(SynthConfig(out=tmp_path / "s", cars=2, views=2, size=48, seed=3, workers=1))
+    store = open_store(tmp_path / "s")
+    config = RunPageConfig(split=None, limit=2, turntables=0, device="cpu")
+    write_run_page(Path("car-gaussians"), store, tmp_path / "out", config)
+    page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+    assert "Learning curve" not in page
+    assert "carstudio train car-gaussians" in page

@@ -26,7 +26,7 @@ from carstudio.report.plots import learning_curve
 from carstudio.report.sheets import Pixels, fit, side_by_side
 from carstudio.report.video import write_gif
 from carstudio.training.checkpoint import describe_model, load_model
-from carstudio.training.log import read_log
+from carstudio.training.log import LOG, read_log
 
 PROTOCOLS: tuple[Protocol, ...] = ("novel-view", "input-view")
 CHECK_HEADS = ("photo and 3-D box", "mask", "truth", "input view", "another photo", "novel view from it")
@@ -193,5 +193,6 @@ def _turntables(
 
 
 def _training(run: Path, commands: list[str]) -> Section:
-    curve = Picture(source=learning_curve(read_log(run / "log.jsonl")), caption="Learning curve")
-    return Section(title="Training", blocks=[curve, Text("The commands:"), Commands(commands)])
+    log = run / LOG  # a bundled model comes without
+    curve = [Picture(source=learning_curve(read_log(log)), caption="Learning curve")] if log.exists() else []
+    return Section(title="Training", blocks=[*curve, Text("The commands:"), Commands(commands)])
