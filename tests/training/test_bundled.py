@@ -8,11 +8,11 @@ import pytest
 import torch
 
 import carstudio
+from carstudio.cli import run
 from carstudio.dataset.sources.synthetic import SynthConfig, synthesize
 from carstudio.dataset.store import open_store
 from carstudio.errors import InputError
 from carstudio.evaluation.protocols import EvaluationConfig, score_views, view_pairs
-from carstudio.report.run_page import RunPageConfig, write_run_page
 from carstudio.training.bundled import bundled_models, find_model
 from carstudio.training.checkpoint import describe_model, load_model
 
@@ -66,8 +66,8 @@ def test_a_bundled_model_has_its_report(tmp_path: Path) -> None:
     """By its name, and without a learning curve: its log is not in the package."""
     synthesize(SynthConfig(out=tmp_path / "s", cars=2, views=2, size=48, seed=3, workers=1))
     store = open_store(tmp_path / "s")
-    config = RunPageConfig(split=None, limit=2, turntables=0, device="cpu")
-    write_run_page(Path("car-gaussians"), store, tmp_path / "out", config)
+    command = ["report", "car-gaussians", "--data", str(store.path), "--out", str(tmp_path / "out"), "--split", "none"]
+    assert run([*command, "--limit", "2", "--turntables", "0", "--device", "cpu", "--json"]) == 0
     page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
     assert "Learning curve" not in page
     assert "carstudio train car-gaussians" in page

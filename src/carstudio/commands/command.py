@@ -52,6 +52,11 @@ class Output:
             yield bars
 
 
+def split_of(text: str | None) -> str | None:
+    """A split's name; `none` in any case, as all verbs write it, is no split."""
+    return None if text is None or text.lower() == "none" else text
+
+
 def plain(value: Any) -> Any:
     """Dataclasses and paths as JSON values."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 import tyro
 
-from carstudio.commands.command import Outcome, Output, provenance
+from carstudio.commands.command import Outcome, Output, provenance, split_of
 from carstudio.dataset.pixels import PatchCache, PreparedPatch
 from carstudio.dataset.store import PatchStore, open_store
 from carstudio.devices import pick_device
@@ -54,7 +54,7 @@ class Fit(Output):
         device = pick_device(self.device)
         model, description = load_model(self.model, device=device), describe_model(self.model)
         store = open_store(self.data)
-        patch_ids = photographs_of(store, self.instance, self.split)
+        patch_ids = photographs_of(store, self.instance, split_of(self.split))
         cache = PatchCache(store, model.encoder_side_px)
         patches = [cache[patch_id] for patch_id in patch_ids]
         with self.progress() as report:

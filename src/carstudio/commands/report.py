@@ -1,11 +1,11 @@
 """`carstudio report`: a trained model scored by both protocols, with pictures, on one HTML page."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import tyro
 
-from carstudio.commands.command import Outcome, Output, plain
+from carstudio.commands.command import Outcome, Output, plain, split_of
 from carstudio.dataset.store import open_store
 from carstudio.evaluation.tables import result_tables, to_markdown
 from carstudio.report.run_page import RunPageConfig, write_run_page
@@ -30,8 +30,9 @@ class WriteReport(Output):
 
     def run(self) -> Outcome:
         """Score, draw and write."""
+        page = replace(self.page, split=split_of(self.page.split))
         with self.progress() as report:
-            summaries = write_run_page(self.model, open_store(self.data), self.out, self.page, report=report)
+            summaries = write_run_page(self.model, open_store(self.data), self.out, page, report=report)
         tables = "\n".join(to_markdown(table) for table in result_tables(summaries, intervals=True))
         index = self.out / "index.html"
         return Outcome(f"{tables}\nreport: {index}", {"report": str(index), "summary": plain(summaries)})

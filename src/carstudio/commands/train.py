@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from carstudio.commands.command import Outcome, Output, plain, provenance
+from carstudio.commands.command import Outcome, Output, plain, provenance, split_of
 from carstudio.dataset.store import PatchStore, open_store
 from carstudio.errors import InputError
 from carstudio.models.interface import CategoryModel
@@ -53,7 +53,7 @@ class Train(Output):
 
     def config(self) -> TrainConfig:
         """The recipe with this command's changes."""
-        config = replace(recipe(self.recipe), seed=self.seed, split=self.split, minutes=self.minutes)
+        config = replace(recipe(self.recipe), seed=self.seed, split=split_of(self.split), minutes=self.minutes)
         if self.steps is not None:
             config = replace(config, steps=self.steps)
         if self.supervision is not None:
@@ -81,7 +81,9 @@ class Train(Output):
 
         def draw(model: CategoryModel, step: int) -> None:
             if self.pictures:
-                views_panel(model, store, self.out / "pictures" / f"step-{step:07d}.png", self.split, self.pictures)
+                views_panel(
+                    model, store, self.out / "pictures" / f"step-{step:07d}.png", split_of(self.split), self.pictures
+                )
 
         with self.progress() as report, held_back_stops() as stops:
             summary = train(
