@@ -272,7 +272,7 @@ def test_real_labels_agree_with_their_projection(test_data: Path, kind: str, fol
 
 
 def test_real_frames_hold_the_known_tracks(test_data: Path, tmp_path: Path) -> None:
-    """FACTS and the data's README: sequence 0001 has 234 car boxes; large views are of tracks 0 to 3, then 4 and 5."""
+    """The data's README: sequence 0001 has 234 car boxes; large views are of tracks 0 to 3, then 4 and 5."""
     segmenter = f"onnx:{test_data / 'segmenter' / 'espnetv2_voc.onnx'}"
     pytest.importorskip("onnxruntime")
     config = BuildConfig(source="kitti-mot", root=test_data / "kitti-mot", out=tmp_path / "s", segmenter=segmenter)

@@ -80,7 +80,7 @@ def test_box_center_agrees_with_the_projection_matrix() -> None:
     P2 = np.array([float(word) for word in CALIBRATION.splitlines()[1].split()[1:]]).reshape(3, 4)
     expected = P2 @ np.array([2.0, 1.65 - 1.5 / 2, 20.0, 1.0])
     np.testing.assert_allclose(P2[:, :3] @ center, expected, rtol=1e-12)
-    np.testing.assert_allclose(calibration.camera_offset, (0.0598, -0.0004, 0.0027), atol=5e-5)  # FACTS section 1
+    np.testing.assert_allclose(calibration.camera_offset, (0.0598, -0.0004, 0.0027), atol=5e-5)  # by hand
     assert calibration.intrinsics == (721.5377, 721.5377, 609.5593, 172.854)
 
 

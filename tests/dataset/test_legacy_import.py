@@ -170,7 +170,7 @@ def test_the_projections_translation_moves_a_box(tmp_path: Path, depth_m: float,
         assert record.box_center is not None
         x, y, z = record.box_center
         places.append((record.fx * x / z, record.fy * y / z))
-    # to the tenth of a pixel that FACTS give; the box stands beside the axis, where the shift in z counts a little too
+    # to the published tenth of a pixel; the box stands beside the axis, where the shift in z counts a little too
     assert math.dist(*places) == pytest.approx(pixels, abs=0.1)
     assert released.camera_offset == (0.0, 0.0, 0.0)
     assert exact.camera_offset == pytest.approx((0.0598, -0.0004, 0.0027), abs=6e-5)

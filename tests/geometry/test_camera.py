@@ -11,7 +11,7 @@ from carstudio.geometry.camera import Camera, camera_offset_from_projection
 from oracles import geometry_slow
 
 INTRINSICS = (721.5377, 700.0, 609.5593, 172.854)
-# KITTI's camera 2, both benchmarks; FACTS section 1: K^-1 P2[:, 3] = (0.0598, -0.0004, 0.0027) m.
+# KITTI's camera 2, both benchmarks; by hand: K^-1 P2[:, 3] = (0.0598, -0.0004, 0.0027) m.
 P2 = (
     (721.5377, 0.0, 609.5593, 44.85728),
     (0.0, 721.5377, 172.854, 0.2163791),

@@ -11,7 +11,7 @@ from carstudio.geometry.box3d import box_from_kitti, envelope
 from carstudio.geometry.camera import Camera, camera_offset_from_projection
 from carstudio.geometry.overlap import box2d_iou
 
-# A box labelled in 3-D and one drawn in the picture agree this well on every whole car (FACTS section 7).
+# A box labelled in 3-D and one drawn in the picture agree this well on every whole car.
 LEAST_IOU = 0.957
 MIN_HEIGHT_PX = 25  # KITTI's own limit for its hard class; below it a pixel of labelling noise is a large share
 UNKNOWN_OCCLUSION = 3

@@ -47,7 +47,7 @@ def batch(count: int = 2, side: int = 32) -> PatchBatch:
 
 
 def test_parameter_counts_by_hand() -> None:
-    """FACTS: 846,340 with the two 512 -> 128 maps (131,328), 715,012 without; summed layer by layer here."""
+    """As released: 846,340 with the two 512 -> 128 maps (131,328), 715,012 without; summed layer by layer here."""
     model = CarNeRF(car_nerf().model)
     linear = lambda inside, outside: inside * outside + outside  # noqa: E731
     position_and_shape = linear(96, 256) + linear(128, 256)

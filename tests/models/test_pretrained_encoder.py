@@ -27,7 +27,7 @@ def save_resnet(folder: Path, **changes: object) -> ResNetModel:
 
 
 def features_by_transformers(model: ResNetModel, image: Tensor) -> Tensor:
-    """FACTS: relu(conv1) and the first three stages, up-sampled to the first's size, concatenated, max-pooled."""
+    """As released: relu(conv1) and the first three stages, up-sampled to the first's size, concatenated, max-pooled."""
     pixels = image * 2 - 1
     stem: list[Tensor] = []
     hook = model.embedder.embedder.register_forward_hook(lambda module, inputs, output: stem.append(output))

@@ -1,4 +1,4 @@
-"""How close a rendering comes to its photograph: PSNR, SSIM, LPIPS and mask IoU, per image (FACTS section 3).
+"""How close a rendering comes to its photograph: PSNR, SSIM, LPIPS and mask IoU, per image.
 
 Images are (height, width, channels) in [0, 1], data range 1; masks hold the values of `MaskValue`. All metrics are of
 ONE image; a table's figure is the mean over images. Metrics are differentiable in their first argument.

@@ -54,7 +54,7 @@ class Camera:
 
 
 def camera_offset_from_projection(projection: Float[Tensor, "3 4"]) -> Float[Tensor, "3"]:
-    """K^-1 P[:, 3] in metres: what KITTI's projection adds to a point of the label frame (FACTS: X_cam = X_label + it).
+    """K^-1 P[:, 3] in metres: what KITTI's projection adds to a point of the label frame (X_camera = X_label + it).
 
     The released code drops it, which moves a box by 8.6 / 4.3 / 2.2 px at 5 / 10 / 20 m for KITTI's camera 2.
     """

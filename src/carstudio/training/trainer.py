@@ -32,7 +32,7 @@ from carstudio.training.schedule import ScheduleConfig, learning_rate
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Everything that decides a run, data aside; the defaults are the paper's (FACTS: 3 x 1,024 pixels, RAdam)."""
+    """Everything that decides a run, data aside; the defaults are the paper's (3 x 1,024 pixels, RAdam)."""
 
     recipe: str = "car-nerf"
     """Name of the recipe it came from; rows and tables call the model by it."""
