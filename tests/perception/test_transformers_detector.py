@@ -224,6 +224,21 @@ def test_weights_that_are_not_numbers_are_refused(tmp_path: Path) -> None:
         TransformersDetector(str(tmp_path), device="cpu").detect(PHOTOS[:1])
 
 
+@pytest.mark.parametrize("kind", ["d_fine", "of_its_own"])
+def test_a_models_own_program_is_never_run(tmp_path: Path, kind: str) -> None:
+    save_dfine(tmp_path)
+    (tmp_path / "own.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\nclass C: pass\n")
+    config = json.loads((tmp_path / "config.json").read_text())
+    parts = {"AutoConfig": "own.C", "AutoModelForObjectDetection": "own.C", "AutoImageProcessor": "own.C"}
+    (tmp_path / "config.json").write_text(json.dumps({**config, "model_type": kind, "auto_map": parts}))
+    if kind == "d_fine":  # known: loaded by transformers' own program
+        make_detector(f"transformers:{tmp_path}")
+    else:
+        with pytest.raises(InputError, match="custom code"):
+            make_detector(f"transformers:{tmp_path}")
+    assert not (tmp_path / "ran").exists()
+
+
 def test_no_preprocessing_is_refused(tmp_path: Path) -> None:
     save_dfine(tmp_path)
     (tmp_path / "preprocessor_config.json").unlink()

@@ -24,7 +24,8 @@ def read_config(name: str, model_types: tuple[str, ...], *, spec: str) -> Any:
     from transformers import AutoConfig
 
     _check_folder(name, spec)
-    config = _load(partial(load_from_hub, AutoConfig.from_pretrained, name), name, spec)
+    read = partial(AutoConfig.from_pretrained, trust_remote_code=False)  # never a model's own program, never a question
+    config = _load(partial(load_from_hub, read, name), name, spec)
     if config.model_type not in model_types:
         raise InputError(
             f"{spec}:{name}: expected a model of type {' or '.join(model_types)}, found {config.model_type!r} in its "
@@ -51,7 +52,7 @@ def read_preprocessing(name: str, *, spec: str, step: int = 1) -> Preprocessing:
 def read_network(build: Callable[..., Any], name: str, *, spec: str) -> nn.Module:
     """The network with its weights on the CPU, ready to be asked; `build` is `SomeModel.from_pretrained`."""
     with _without_progress_bars():
-        load = partial(build, output_loading_info=True, dtype=torch.float32)
+        load = partial(build, output_loading_info=True, dtype=torch.float32, trust_remote_code=False)
         network, found = _load(partial(load_from_hub, load, name), name, spec)
     missing = sorted(found["missing_keys"])
     if missing:
