@@ -4,21 +4,27 @@ import csv
 import io
 import json
 import math
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from carstudio.dataset import plans
 from carstudio.dataset.build import BuildConfig, build
+from carstudio.dataset.duplicates import read_duplicates
 from carstudio.dataset.filters import FilterRecipe
+from carstudio.dataset.inputs import digest_of_inputs
 from carstudio.dataset.patch import MaskValue
+from carstudio.dataset.plans import input_places
 from carstudio.dataset.sources.dvm_cars import expected_yaw
 from carstudio.dataset.store import PatchStore, open_store
 from carstudio.errors import InputError
 from carstudio.images import decode_image, encode_png
 from carstudio.perception.coco import read_results
+from carstudio.perception.results import Detection2D, Photo
 from carstudio.perception.rle import encode_rle
 from carstudio.synthetic.cars import draw_car
 from carstudio.synthetic.photographs import draw_photographs
@@ -408,3 +414,57 @@ def test_dvm_cars_made_of_synthetic_cars(tmp_path: Path) -> None:
         assert record.box_center == pytest.approx(box.center.tolist(), abs=1e-5)
         assert record.box_iou is not None
         assert record.box_iou > 0.8  # a car's silhouette does not fill the envelope of its box
+
+
+@dataclass(frozen=True)
+class Touchy:
+    """A detector that fails on dark photographs, alone or in company."""
+
+    def detect(self, photos: Sequence[Photo]) -> list[list[Detection2D]]:
+        if any(photo.image.max() == 0 for photo in photos):
+            raise InputError("too dark")
+        return [[Detection2D((10.0, 10.0, 60.0, 60.0), "Car", 0.9)] for _ in photos]
+
+
+def test_a_photo_that_the_detector_cannot_bear_costs_only_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(plans, "make_detector", lambda spec: Touchy())
+    for number in range(6):
+        pixels = np.zeros((90, 120, 3), np.uint8) if number == 2 else shaded(90, 120)
+        path = tmp_path / "p" / f"{number}.png"
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(encode_png(pixels))
+    config = BuildConfig(source="photos", root=tmp_path / "p", out=tmp_path / "s", workers=1, detector="onnx:x")
+    summary = build(config)
+    assert summary.problems == ("frame 2 skipped: too dark",)
+    assert summary.candidates == 5
+
+
+def test_copies_of_a_photo_are_found_and_stay_on_one_side(tmp_path: Path) -> None:
+    """A build of photographs looks for repeated pictures by itself; one of KITTI, whose cars have names, does not."""
+    folder = tmp_path / "p"
+    folder.mkdir()
+    image = photograph(200, 300, seed=3)
+    (folder / "a.png").write_bytes(encode_png(image))
+    Image.fromarray(image).save(folder / "b.jpg", quality=60)
+    (folder / "c.png").write_bytes(encode_png(photograph(200, 300, seed=4)))
+    boxes = {name: [[20.0, 20.0, 279.0, 179.0]] for name in ("a.png", "b.jpg", "c.png")}
+    store = build_photos(folder, tmp_path / "s", detector=f"precomputed:{results(tmp_path / 'r.json', boxes)}")
+    found = read_duplicates(store)
+    assert found is not None
+    assert found.group == (0, 0, None)
+    assert found.kind == ("near", "near", None)
+    root = made_up_kitti(tmp_path / "kitti")
+    build(BuildConfig(source="kitti-mot", root=root, out=tmp_path / "k", workers=1))
+    assert read_duplicates(open_store(tmp_path / "k")) is None
+
+
+def test_a_photo_that_a_list_names_is_an_input_too(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(encode_png(shaded(90, 120)))
+    (tmp_path / "list.txt").write_text("a.png\n")
+    config = BuildConfig(source="photos", root=tmp_path / "list.txt", out=tmp_path / "s")
+    before = digest_of_inputs(input_places(config))
+    assert digest_of_inputs(input_places(config)) == before
+    (tmp_path / "a.png").write_bytes(encode_png(shaded(91, 120)))
+    assert digest_of_inputs(input_places(config)) != before

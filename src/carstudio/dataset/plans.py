@@ -16,11 +16,12 @@ from carstudio.dataset.filters import DVM_CARS, FilterRecipe
 from carstudio.dataset.known_boxes import make_box_estimator
 from carstudio.dataset.legacy_json.importer import KEEP_RELEASED, SOURCE, LegacyJob, open_legacy
 from carstudio.dataset.patch import PatchRecord
-from carstudio.dataset.recognition import Perception, recognise
+from carstudio.dataset.recognition import Perception, Pixels, recognise
 from carstudio.dataset.sources.dvm_cars import open_dvm_cars
-from carstudio.dataset.sources.frame import CameraOffset, FrameRef, Source
+from carstudio.dataset.sources.frame import CameraOffset, Frame, FrameRef, Source
 from carstudio.dataset.sources.kitti_det import open_kitti_det
 from carstudio.dataset.sources.kitti_mot import open_kitti_mot
+from carstudio.dataset.sources.photo_files import find_photos
 from carstudio.dataset.sources.photos import open_photos
 from carstudio.devices import pick_device
 from carstudio.errors import InputError
@@ -102,9 +103,12 @@ class FrameJob:
             except InputError as error:
                 problems.append(f"frame {ref.stem} skipped: {error}")
         records: list[PatchRecord] = []
-        for frame, pixels in zip(recognise(frames, pictures, self.perception), pictures, strict=True):
+        for found, pixels in zip(self._recognise(frames, pictures), pictures, strict=True):
+            if isinstance(found, str):
+                problems.append(found)
+                continue
             result = records_of_frame(
-                frame,
+                found,
                 self.perception.segmenter,
                 source=self.source.name,
                 licence=self.source.licence,
@@ -115,6 +119,16 @@ class FrameJob:
             records += result.records
             problems += result.problems
         return FrameResult(tuple(records), tuple(problems), num_items=len(refs))
+
+    def _recognise(self, frames: list[Frame], pictures: list[Pixels]) -> list[Frame | str]:
+        """Each frame as perception sees it, or the problem it has with it; one by one where not all go together."""
+        try:
+            return list(recognise(frames, pictures, self.perception))
+        except InputError as error:
+            if len(frames) == 1:
+                return [f"frame {frames[0].frame_id} skipped: {error}"]
+        pairs = zip(frames, pictures, strict=True)
+        return [self._recognise([frame], [picture])[0] for frame, picture in pairs]
 
 
 @contextmanager
@@ -220,15 +234,16 @@ def open_source(config: BuildConfig) -> Source:
 
 def input_places(config: BuildConfig) -> list[str | Path]:
     """Files and folders that decide the store."""
-    root = Path(config.root)
-    base = root if (root / "calib").is_dir() else root / "training"
-    below = {
-        "kitti-det": [base / "image_2", base / "label_2", base / "calib"],
-        "kitti-mot": [base / "image_02" / (config.sequence or ""), base / "label_02", base / "calib"],
-    }
+    root, places = Path(config.root), [config.root]
+    if config.source == "photos":  # a list or pattern names photographs anywhere
+        places += [photo.location for photo in find_photos(str(config.root))] if not root.is_dir() else []
+    elif config.source in ("kitti-det", "kitti-mot"):  # other folders of KITTI's (velodyne) decide nothing
+        images, labels = ("image_2", "label_2") if config.source == "kitti-det" else ("image_02", "label_02")
+        base = root if (root / images).is_dir() else root / "training"
+        places = [base / images / (config.sequence or ""), base / labels, base / "calib"]
     specs = (config.detector, config.segmenter, config.box3d, config.camera)
     named = [spec.partition(":")[2] for spec in specs if spec and ":" in spec]
-    return [*below.get(config.source, [str(config.root)]), *(path for path in named if Path(path).exists())]
+    return [*places, *(path for path in named if Path(path).exists())]
 
 
 def uses_accelerator(config: BuildConfig) -> bool:
