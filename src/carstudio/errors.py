@@ -27,3 +27,14 @@ class Interrupted(KeyboardInterrupt):
     def __init__(self, number: int = signal.SIGINT) -> None:
         super().__init__(number)
         self.signal = number
+
+
+def first_line(error: Exception, most: int = 200) -> str:
+    """What a library says of its own error, in one line of at most so many characters."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:most]
+
+
+def shortened(value: object, most: int = 90) -> str:
+    """A value as it was found, for a message."""
+    text = repr(value)
+    return text if len(text) <= most else f"{text[: most - 3]}..."

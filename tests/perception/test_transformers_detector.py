@@ -12,11 +12,11 @@ from torch import nn
 from carstudio.errors import InputError
 from carstudio.perception.results import Detection2D, Detector, Photo
 from carstudio.perception.specs import make_detector
+from carstudio.perception.suppression import without_doubles
 from carstudio.perception.transformers_detector import (
     TransformersDetector,
     edges_px,
     open_network,
-    without_doubles,
 )
 from carstudio.perception.vehicle_classes import vehicle_classes, vehicle_type
 from carstudio.perception.weights import DEFAULT_DETECTOR

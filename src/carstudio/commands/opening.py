@@ -12,17 +12,18 @@ from carstudio.training.checkpoint import describe_model, load_model
 def open_car(folder: Path, run: Path | None) -> tuple[CategoryModel, Car]:
     """The car of a folder and its model; `InputError` when it is another model than the one it was made with."""
     car = load_car(folder)
-    if run is None:
-        run = bundled_models().get(car.model_name)
-    if run is None or (describe_model(run).sha256 != car.model_sha256 and run in bundled_models().values()):
+    made_with = f"{car.model_name}, weights {car.model_sha256[:16]}"
+    if run is not None and describe_model(run).sha256 != car.model_sha256:
         raise InputError(
-            f"{folder}: made with the model {car.model_name} (weights {car.model_sha256[:16]}), which is not bundled; "
-            "name its folder: --model RUN"
+            f"{run}: not the model that {folder} was made with ({made_with}); fit the car again with this one"
         )
-    if describe_model(run).sha256 != car.model_sha256:
+    if run is None:
+        run = next(
+            (path for path in bundled_models().values() if describe_model(path).sha256 == car.model_sha256), None
+        )
+    if run is None:
         raise InputError(
-            f"{run}: not the model that {folder} was made with ({car.model_name}, weights {car.model_sha256[:16]}); "
-            "fit the car again with this one"
+            f"{folder}: made with the model {made_with}, which is not bundled; name its folder: --model RUN"
         )
     model = load_model(run)
     put_weights(model, car, name=str(folder))

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from carstudio.errors import InputError
+from carstudio.errors import InputError, shortened
 from carstudio.files import read_json, write_json
 
 FORMAT = "carpatch3d"
@@ -97,16 +97,16 @@ def _problems(content: dict[str, Any]) -> Iterator[str]:
     """What fields hold that they must not; totals that contradict the shards show that one of them was changed."""
     version, sources, resume_key = (content.get(name) for name in ("format_version", "sources", "resume_key"))
     if not _is_count(version) or version == 0:
-        yield f"format_version must be a whole number from 1 on, found {_short(version)}"
+        yield f"format_version must be a whole number from 1 on, found {shortened(version)}"
     if not isinstance(content.get("is_finished"), bool):
-        yield f"is_finished must be true or false, found {_short(content.get('is_finished'))}"
+        yield f"is_finished must be true or false, found {shortened(content.get('is_finished'))}"
     if not (resume_key is None or (isinstance(resume_key, str) and resume_key.isprintable())):
-        yield f"resume_key must be a text or null, found {_short(resume_key)}"
+        yield f"resume_key must be a text or null, found {shortened(resume_key)}"
     if not isinstance(sources, list) or not all(isinstance(name, str) and name.isprintable() for name in sources):
-        yield f"sources must be a list of names, found {_short(sources)}"
+        yield f"sources must be a list of names, found {shortened(sources)}"
     shards = content.get("shards")
     if not isinstance(shards, list):
-        yield f"shards must be a list, found {_short(shards)}"
+        yield f"shards must be a list, found {shortened(shards)}"
         return
     for shard in shards:
         yield from _shard_problems(shard)
@@ -114,33 +114,28 @@ def _problems(content: dict[str, Any]) -> Iterator[str]:
         yield "two shards have the same name"
     total = sum(shard["num_patches"] for shard in shards)
     if content.get("num_patches") != total:
-        yield f"num_patches must be {total} as its shards say, found {_short(content.get('num_patches'))}"
+        yield f"num_patches must be {total} as its shards say, found {shortened(content.get('num_patches'))}"
     checksum = data_sha256((shard["name"], shard["sha256"]) for shard in shards)
     if content.get("data_sha256") != checksum:
-        yield f"data_sha256 must be {checksum} as its shards say, found {_short(content.get('data_sha256'))}"
+        yield f"data_sha256 must be {checksum} as its shards say, found {shortened(content.get('data_sha256'))}"
 
 
 def _shard_problems(shard: Any) -> Iterator[str]:
     if not isinstance(shard, dict) or shard.keys() != _SHARD_KEYS:
         found = sorted(shard) if isinstance(shard, dict) else shard
-        yield f"a shard must have {', '.join(sorted(_SHARD_KEYS))}, found {_short(found)}"
+        yield f"a shard must have {', '.join(sorted(_SHARD_KEYS))}, found {shortened(found)}"
         return
     name, count, checksum = shard["name"], shard["num_patches"], shard["sha256"]
     if not (isinstance(name, str) and _SHARD_NAME.fullmatch(name)):
-        yield f"shard {_short(name)}: expected the name of a file in data/, such as part-00000.parquet"
+        yield f"shard {shortened(name)}: expected the name of a file in data/, such as part-00000.parquet"
     if not _is_count(count):
-        yield f"shard {_short(name)}: num_patches must be 0 or more, found {_short(count)}"
+        yield f"shard {shortened(name)}: num_patches must be 0 or more, found {shortened(count)}"
     if not (isinstance(checksum, str) and _SHA256.fullmatch(checksum)):
-        yield f"shard {_short(name)}: sha256 must be 64 hexadecimal digits, found {_short(checksum)}"
+        yield f"shard {shortened(name)}: sha256 must be 64 hexadecimal digits, found {shortened(checksum)}"
 
 
 def _is_count(value: Any) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**53
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 90 else f"{text[:87]}..."
 
 
 def _manifest_from_json(content: dict[str, Any]) -> Manifest:

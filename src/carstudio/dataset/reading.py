@@ -7,7 +7,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from carstudio.errors import InputError
+from carstudio.errors import InputError, first_line
 
 
 @contextmanager
@@ -16,10 +16,9 @@ def reading(path: Path) -> Iterator[None]:
     try:
         yield
     except (pa.ArrowException, OSError, UnicodeDecodeError, OverflowError) as error:
-        first = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(
-            f"{path}: expected a whole Parquet file, found a damaged one or something else ({first}); restore it, or "
-            "build the store again"
+            f"{path}: expected a whole Parquet file, found a damaged one or something else ({first_line(error)}); "
+            "restore it, or build the store again"
         ) from error
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from carstudio import __version__
-from carstudio.errors import InputError
+from carstudio.errors import InputError, shortened
 from carstudio.files import parse_json, read_json, write_json, write_text
 
 METRICS = ("psnr", "psnr_mask", "ssim", "ssim_mask", "lpips", "mask_iou")
@@ -113,19 +113,14 @@ def _row(line: str, where: str) -> ResultRow:
 def _checked(name: str, value: Any, where: str) -> Any:
     if name in _TEXT:
         if not isinstance(value, str):
-            raise InputError(f"{where}: {name} must be a string, found {_short(value)}")
+            raise InputError(f"{where}: {name} must be a string, found {shortened(value)}")
         return value
     if name in _WHOLE:
         if isinstance(value, bool) or not isinstance(value, int):
-            raise InputError(f"{where}: {name} must be a whole number, found {_short(value)}")
+            raise InputError(f"{where}: {name} must be a whole number, found {shortened(value)}")
         return value
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
-        raise InputError(f"{where}: {name} must be a finite number or null, found {_short(value)}")
+        raise InputError(f"{where}: {name} must be a finite number or null, found {shortened(value)}")
     return float(value)
-
-
-def _short(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."

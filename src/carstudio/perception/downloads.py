@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from carstudio.errors import InputError, StorageError
+from carstudio.errors import InputError, StorageError, first_line
 from carstudio.files import make_folder
 from carstudio.hub import hub_answers
 from carstudio.progress import Report, silent
@@ -75,7 +75,7 @@ def _files(name: str) -> tuple[str, dict[str, int]]:
             "OWNER/MODEL"
         ) from error
     except (HfHubHTTPError, OSError) as error:
-        raise InputError(f"{name}: the hub refuses ({str(error).splitlines()[0][:200]}); try again later") from error
+        raise InputError(f"{name}: the hub refuses ({first_line(error)}); try again later") from error
     sizes = {file.rfilename: file.size or 0 for file in info.siblings or []}
     return info.sha or "main", {file: sizes[file] for file in _wanted(name, list(sizes))}
 

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import torch
 from torch import nn
 
-from carstudio.errors import InputError
+from carstudio.errors import InputError, first_line
 from carstudio.hub import load_from_hub
 from carstudio.perception.preprocessing import Preprocessing, parse_preprocessing
 
@@ -94,27 +94,23 @@ def _load(load: Callable[[], Any], name: str, spec: str) -> Any:
     try:
         return load()
     except ImportError as error:
-        raise InputError(f"{spec}:{name}: {_first_line(error)}; install it, or choose another model") from error
+        raise InputError(f"{spec}:{name}: {first_line(error)}; install it, or choose another model") from error
     except OSError as error:
         if Path(name).is_dir():
             raise InputError(
-                f"{spec}:{name}: no weights that can be read ({_first_line(error)}); expected model.safetensors as "
+                f"{spec}:{name}: no weights that can be read ({first_line(error)}); expected model.safetensors as "
                 "save_pretrained writes it"
             ) from error
         raise InputError(
             f"{spec}:{name} is not on this machine and cannot be downloaded now; run `carstudio models download {name} "
             f"--out FOLDER` where there is a network, carry FOLDER here and say {spec}:FOLDER; or check the name "
-            f"({_first_line(error)})"
+            f"({first_line(error)})"
         ) from error
     except Exception as error:  # whatever a broken file makes transformers, safetensors or torch raise
         raise InputError(
-            f"{spec}:{name}: cannot be loaded ({type(error).__name__}: {_first_line(error)}); fetch the model again, "
+            f"{spec}:{name}: cannot be loaded ({type(error).__name__}: {first_line(error)}); fetch the model again, "
             "or name another one"
         ) from error
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:300]
 
 
 @contextlib.contextmanager

@@ -16,9 +16,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from carstudio.errors import InputError
-from carstudio.perception.onnx_session import first_line, start_session
+from carstudio.errors import InputError, first_line
+from carstudio.perception.onnx_session import start_session
 from carstudio.perception.results import Detection2D, Photo
+from carstudio.perception.suppression import without_doubles
 from carstudio.perception.vehicle_classes import COCO_CLASS_NUMBERS
 
 STRIDES = (8, 16, 32)
@@ -57,7 +58,7 @@ class OnnxDetector:
         sure = np.flatnonzero(score > self.threshold)
         boxes = np.clip(boxes[sure] / scale, 0, [width, height, width, height])
         found = []
-        for i in keep_best(boxes, score[sure], self.nms_iou):
+        for i in without_doubles(boxes, np.argsort(-score[sure], kind="stable").tolist(), self.nms_iou):
             x0, y0, x1, y1 = boxes[i].tolist()
             if x1 - x0 >= 1 and y1 - y0 >= 1:
                 kind = COCO_CLASS_NUMBERS[int(kinds[best[sure[i]]])]
@@ -96,22 +97,6 @@ def decode(
     half = np.exp(np.minimum(output[:, 2:_BOX].astype(np.float64), 20.0)) * stride_of / 2
     scores = output[:, _BOX : _BOX + 1] * output[:, _BOX + 1 :]
     return np.concatenate([center - half, center + half], axis=1), scores
-
-
-def keep_best(boxes: Float[np.ndarray, "n 4"], scores: Float[np.ndarray, " n"], most_iou: float) -> list[int]:
-    """Greedy non-maximum suppression: indices in descending order of score (ties: as they stand)."""
-    order = np.argsort(-scores, kind="stable")
-    area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
-    kept: list[int] = []
-    while order.size:
-        first, order = int(order[0]), order[1:]
-        kept.append(first)
-        low = np.maximum(boxes[first, :2], boxes[order, :2])
-        high = np.minimum(boxes[first, 2:], boxes[order, 2:])
-        common = (high - low).clip(0).prod(axis=1)
-        union = area[first] + area[order] - common
-        order = order[common <= most_iou * union]
-    return kept
 
 
 @lru_cache(maxsize=2)

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from carstudio.errors import InputError
+from carstudio.errors import InputError, first_line
 from carstudio.perception.hulls import allowed_pixels, clean_mask, enlarged_window, occluded_pixels, visible_height_px
-from carstudio.perception.onnx_session import first_line, start_session
+from carstudio.perception.onnx_session import start_session
 from carstudio.perception.results import MaskResult, SegmentRequest
 
 VOC_CAR = 7

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from carstudio.errors import InputError
+from carstudio.errors import InputError, first_line
 
 
 def start_session(file: str, purpose: str) -> Any:
@@ -25,8 +25,3 @@ def start_session(file: str, purpose: str) -> Any:
         found = [item.name for item in session.get_inputs()]
         raise InputError(f"{file}: expected one input, float32 [1, 3, height, width], found {found}")
     return session
-
-
-def first_line(error: Exception) -> str:
-    """What a library says, in one line."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from carstudio.errors import InputError
+from carstudio.images import MAX_IMAGE_PIXELS
 
-MAX_PIXELS = 120_000_000
 _GROUP_BITS, _MORE, _SIGN = 5, 0x20, 0x10
 
 
@@ -23,8 +23,8 @@ def decode_rle(value: Any, *, name: str) -> Bool[np.ndarray, "height width"]:
             f'{name}: expected run lengths {{"size": [height, width], "counts": ...}}, found {value!r:.80}'
         )
     height, width = size
-    if height * width > MAX_PIXELS:
-        raise InputError(f"{name}: a mask of {width} x {height} pixels; at most {MAX_PIXELS:,} are read")
+    if height * width > MAX_IMAGE_PIXELS:
+        raise InputError(f"{name}: a mask of {width} x {height} pixels; at most {MAX_IMAGE_PIXELS:,} are read")
     runs = runs_from_text(counts, name=name) if isinstance(counts, str) else counts
     if not isinstance(runs, list) or not all(isinstance(run, int) and run >= 0 for run in runs):
         raise InputError(f"{name}: run lengths must be whole numbers from 0 on, found {counts!r:.80}")

@@ -16,10 +16,10 @@ from torch import Tensor, nn
 
 from carstudio.devices import pick_device
 from carstudio.errors import InputError
-from carstudio.geometry.overlap import box2d_iou
 from carstudio.perception.hub_models import Precision, low_precision, read_config, read_network, read_preprocessing
 from carstudio.perception.preprocessing import Preprocessing
 from carstudio.perception.results import Detection2D, Photo
+from carstudio.perception.suppression import without_doubles
 from carstudio.perception.vehicle_classes import vehicle_classes
 from carstudio.perception.weights import DEFAULT_DETECTOR
 
@@ -141,17 +141,6 @@ def edges_px(boxes: Float[np.ndarray, "n 4"], width: int, height: int) -> Float[
     edges = np.concatenate([center - half, center + half], axis=1)
     limit = np.array([width, height, width, height], np.float64)
     return np.clip(edges * limit, 0.0, limit)
-
-
-def without_doubles(edges: Float[np.ndarray, "n 4"], order: Sequence[int], most_iou: float) -> list[int]:
-    """Of `order`, those that overlap no earlier one that stays by more than `most_iou`."""
-    boxes = torch.from_numpy(edges[list(order)])
-    iou = box2d_iou(boxes[:, None], boxes[None])
-    kept: list[int] = []
-    for row in range(len(order)):
-        if not (iou[row, kept] > most_iou).any():
-            kept.append(row)
-    return [order[row] for row in kept]
 
 
 def _batches(shapes: Sequence[tuple[int, ...]], size: int) -> Iterator[list[int]]:

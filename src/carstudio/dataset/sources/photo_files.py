@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from carstudio.errors import InputError
+from carstudio.errors import InputError, first_line
 from carstudio.images import MAX_IMAGE_BYTES, read_image_file
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
@@ -73,8 +73,7 @@ def _read_url(url: str, max_bytes: int) -> bytes:
         with fsspec.open(url, "rb") as file:
             data: bytes = file.read(max_bytes + 1)
     except Exception as error:  # every protocol has its own
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
-        raise InputError(f"{url}: cannot be read ({type(error).__name__}: {reason})") from error
+        raise InputError(f"{url}: cannot be read ({type(error).__name__}: {first_line(error)})") from error
     if len(data) > max_bytes:
         raise InputError(f"{url}: at most {max_bytes:,} bytes are read, found more; check the file")
     return data
@@ -158,7 +157,7 @@ def _parquet_rows(data: bytes, location: str) -> list[tuple[str, Mapping[str, An
         table = pq.read_table(pa.BufferReader(data))
         rows = table.select([name for name in table.column_names if name in _COLUMNS]).to_pylist()
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{location}: expected a Parquet list ({str(error).splitlines()[0][:200]})") from error
+        raise InputError(f"{location}: expected a Parquet list ({first_line(error)})") from error
     return [(f"row {number}", row) for number, row in enumerate(rows, start=1)]
 
 
