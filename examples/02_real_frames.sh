@@ -5,7 +5,7 @@
 #
 # KITTI/training has KITTI tracking's own layout (image_02, label_02, calib). SEGMENTER is `grabcut` (needs nothing) or
 # `onnx:FILE`, a semantic-segmentation network, which is better on real frames. MODEL is a bundled one: car-gaussians or
-# car-nerf-small. Takes about eight minutes on four cores; what an earlier call finished is not done again. Two dozen
+# car-nerf-small. Takes five minutes on three cores; what an earlier call finished is not done again. Two dozen
 # frames hold too few views to learn a car's unseen sides from: the fine-tuned run starts from the bundled weights, which
 # have seen synthetic cars only.
 set -eu

@@ -26,7 +26,7 @@ TURNTABLES = 6
 
 @dataclass(frozen=True, kw_only=True)
 class DemoConfig:
-    """Size of the demo; the defaults take about eight minutes on four cores."""
+    """Size of the demo; the defaults take six and a half minutes on three cores."""
 
     out: Path
     cars: int = 200
