@@ -1,0 +1,1 @@
+"""Scenes: a driving log with its cars taken out as objects, edited as values and drawn back into the photographs."""
