@@ -104,7 +104,8 @@ def execute(command: "Output") -> int:
     """Run a parsed verb and print its outcome."""
     outcome = command.run()
     try:
-        print(json.dumps(outcome.value, indent=2) if command.json else outcome.text, flush=True)
+        if outcome.text:  # of several processes that do one thing together only the first speaks
+            print(json.dumps(outcome.value, indent=2) if command.json else outcome.text, flush=True)
     except BrokenPipeError:  # nobody reads on (`| head`): what could be said to whom?
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the buffer's rest goes there at the end
     return 0

@@ -12,12 +12,14 @@ from typing import Any
 from carstudio import __version__
 from carstudio.dataset.sources.synthetic import SynthConfig, synthesize
 from carstudio.dataset.store import PatchStore, open_store
+from carstudio.devices import pick_device
 from carstudio.files import read_json, write_json
 from carstudio.progress import Report, silent
 from carstudio.recipes import recipe
 from carstudio.report.panels import views_panel
 from carstudio.report.run_page import RunPageConfig, write_run_page
 from carstudio.signals import held_back_stops
+from carstudio.training.team import good_number_of_processes
 from carstudio.training.trainer import TrainSummary, train
 
 SCORED_IMAGES = 120
@@ -51,7 +53,8 @@ class DemoConfig:
         data, run = shlex.quote(str(self.data)), shlex.quote(str(self.run))
         lines = [
             f"carstudio synth --cars {self.cars} --views {self.views} --size 128 --seed {self.seed} --out {data}",
-            f"carstudio train {self.model} --data {data} --out {run} --minutes {self.minutes:g} --seed {self.seed}",
+            f"carstudio train {self.model} --data {data} --out {run} --minutes {self.minutes:g} --seed {self.seed} "
+            f"--processes {good_number_of_processes(pick_device(self.device))}",
         ]
         out = shlex.quote(str(self.out))
         return [*lines, f"carstudio report {run} --data {data} --out {out} --limit {SCORED_IMAGES}"]
@@ -105,6 +108,7 @@ def _train(config: DemoConfig, store: PatchStore, report: Report, should_stop: C
             model, store, config.run / "pictures" / f"step-{step:07d}.png", "instance", 4
         ),
         should_stop=should_stop,
+        processes=good_number_of_processes(pick_device(config.device)),
     )
     write_json(done, asdict(summary))
     return asdict(summary)

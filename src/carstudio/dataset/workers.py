@@ -58,9 +58,9 @@ def ordered_map(
 @contextmanager
 def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
     context = multiprocessing.get_context("spawn")  # torch and onnxruntime have threads: forking them is not safe
-    _start_tracker()
+    start_tracker()
     others = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin)
+    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=begin_worker)
     try:
         yield pool
         pool.shutdown()
@@ -71,7 +71,7 @@ def _pool(workers: int) -> Iterator[ProcessPoolExecutor]:
         raise
 
 
-def _start_tracker() -> None:
+def start_tracker() -> None:
     """Start what removes the semaphores of a process that ends without doing so itself, and tell it to keep quiet.
 
     It starts here because its start unblocks signals, which must not happen while a worker starts.
@@ -93,11 +93,18 @@ def _submit(pool: ProcessPoolExecutor, work: Callable[[Item], Result], items: Se
 
     They are held back as well, so that no worker is started without the pool knowing of it.
     """
+    with blocked_stops():
+        return pool.submit(_run, work, items)
+
+
+@contextmanager
+def blocked_stops() -> Iterator[None]:
+    """Processes started inside the block never hear stop signals; this one hears them at its end."""
     with held_back_stops():
         can_block = hasattr(signal, "pthread_sigmask")
         before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS) if can_block else set()
         try:
-            return pool.submit(_run, work, items)
+            yield
         finally:
             if can_block:
                 signal.pthread_sigmask(signal.SIG_SETMASK, before)
@@ -107,7 +114,7 @@ def _run(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
     return [work(item) for item in items]
 
 
-def _begin() -> None:
+def begin_worker() -> None:
     """One process per core, one thread per process; end with the parent."""
     cv2.setNumThreads(1)
     torch.set_num_threads(1)

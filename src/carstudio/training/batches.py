@@ -3,6 +3,7 @@
 The sampler has no state: the patches of step k are found from the seed alone, so a run resumes in mid-epoch exactly.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -22,10 +23,10 @@ Mirroring = Literal["off", "together", "apart"]
 _STREAMS = {"epoch": 1, "target": 2, "pixels": 3, "jitter": 4, "mirror": 5}
 
 
-def generator_for(seed: int, step: int, stream: str) -> torch.Generator:
-    """A CPU generator for one purpose of one step; streams and steps never share numbers."""
-    mixed = (seed * 0x9E3779B97F4A7C15 + step * 0xBF58476D1CE4E5B9 + _STREAMS[stream] * 0x94D049BB133111EB) % 2**63
-    return torch.Generator().manual_seed(mixed)
+def generator_for(seed: int, step: int, stream: str, row: int = 0) -> torch.Generator:
+    """A CPU generator for one purpose of one step (and one row of its batch); none of them share numbers."""
+    mixed = seed * 0x9E3779B97F4A7C15 + step * 0xBF58476D1CE4E5B9 + _STREAMS[stream] * 0x94D049BB133111EB
+    return torch.Generator().manual_seed((mixed + row * 0xD6E8FEB86659FD93) % 2**63)
 
 
 @dataclass(frozen=True)
@@ -69,10 +70,16 @@ def stack_boxes(boxes: list[Box3D]) -> Box3D:
     )
 
 
-def pixel_batch(patches: list[PreparedPatch], rays_per_patch: int, generator: torch.Generator) -> PixelBatch:
-    """Pixels drawn evenly, with replacement, from the whole crop of each patch (patches of any size will do)."""
+def pixel_batch(
+    patches: list[PreparedPatch], rays_per_patch: int, generators: torch.Generator | Sequence[torch.Generator]
+) -> PixelBatch:
+    """Pixels drawn evenly, with replacement, from the whole crop of each patch (patches of any size will do).
+
+    By one generator in turn, or by one for each patch, so that a patch's pixels do not depend on the others.
+    """
+    each = [generators] * len(patches) if isinstance(generators, torch.Generator) else generators
     positions, rgb, mask = [], [], []
-    for patch in patches:
+    for patch, generator in zip(patches, each, strict=True):
         height, width = patch.mask.shape
         picked = torch.randint(height * width, (rays_per_patch,), generator=generator)
         positions.append(torch.stack([picked % width, picked // width], dim=-1).float() + 0.5)
@@ -155,15 +162,16 @@ class StepSampler:
         second = 0 if self.mirroring == "together" else 1
         return [(bool(row[0]), bool(row[second])) for row in draws]
 
-    def batch(self, step: int, rays_per_patch: int) -> tuple[PatchBatch, PixelBatch]:
-        """Everything step `step` needs."""
+    def batch(self, step: int, rays_per_patch: int, rows: range | None = None) -> tuple[PatchBatch, PixelBatch]:
+        """Everything step `step` needs, or some rows of it: the same whoever else takes the others."""
+        rows = range(self.patches_per_step) if rows is None else rows
         inputs = self.input_ids(step)
         targets = self.target_ids(step, inputs)
         flips = self.mirrored(step)
-        shown = [self._patch(patch_id, flip[0]) for patch_id, flip in zip(inputs, flips, strict=True)]
-        explained = [self._patch(patch_id, flip[1]) for patch_id, flip in zip(targets, flips, strict=True)]
-        pixels = pixel_batch(explained, rays_per_patch, generator_for(self.seed, step, "pixels"))
-        return patch_batch(shown), pixels
+        shown = [self._patch(inputs[row], flips[row][0]) for row in rows]
+        explained = [self._patch(targets[row], flips[row][1]) for row in rows]
+        generators = [generator_for(self.seed, step, "pixels", row) for row in rows]
+        return patch_batch(shown), pixel_batch(explained, rays_per_patch, generators)
 
     def _patch(self, patch_id: str, is_mirrored: bool) -> PreparedPatch:
         return mirror_patch(self.cache[patch_id]) if is_mirrored else self.cache[patch_id]

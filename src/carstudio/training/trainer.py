@@ -5,13 +5,14 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from carstudio.dataset.pixels import PatchCache
-from carstudio.dataset.store import PatchStore
+from carstudio.dataset.store import PatchStore, open_store
 from carstudio.devices import pick_device
 from carstudio.errors import InputError, Interrupted
 from carstudio.files import remove_partials
@@ -28,6 +29,7 @@ from carstudio.training.losses import LossConfig, masked_psnr, training_loss
 from carstudio.training.precision import Precision, autocast, resolve_precision
 from carstudio.training.resume import STATE, TrainingState, load_state, save_state
 from carstudio.training.schedule import ScheduleConfig, learning_rate
+from carstudio.training.team import Team, team_of, torchrun_device
 
 
 @dataclass(frozen=True)
@@ -94,24 +96,54 @@ def train(
     report: Report = silent,
     on_save: Callable[[CategoryModel, int], None] | None = None,
     should_stop: Callable[[], bool] = lambda: False,
+    processes: int = 1,
 ) -> TrainSummary:
     """Train a model on a store's kept patches and leave it in `out` (model, log, state to resume from).
+
+    On a CPU `processes` share each step's patches (`training/team.py`); a script that asks for them needs
+    `if __name__ == "__main__":`, as they import it. Under torchrun every process calls this.
 
     `init` is a trained model of the same config whose weights the run starts from (a resumed run has its own).
     `on_save(model, step)` is called after each checkpoint, for pictures. Once `should_stop()` is true, the state of the
     finished step is saved and `Interrupted` raised. Killed at any moment and resumed, a run by steps ends with the same
     bits on a CPU as an uninterrupted one (a run by minutes follows the clock). `out` is locked while it is written.
     """
-    run = _Run(config, store, out, pick_device(device), provenance or {})
-    refuse_wrong_start(out, resume=resume)
-    with FolderLock(out):
-        remove_partials(out)
-        run.begin(init=init)
-        try:
-            _steps(run, report, on_save or _draw_nothing, should_stop)
-        finally:
-            run.close()
+    place = torchrun_device(pick_device(device))
+    if not 1 <= processes <= config.patches_per_step:
+        raise InputError(
+            f"processes share a step's patches: expected 1 to {config.patches_per_step}, found {processes}"
+        )
+    along = partial(_train_along, config, store.path, out, device, init)
+    with team_of(processes, place, along) as team:
+        run = _Run(config, store, out, place, provenance or {}, team)
+        if not team.is_first:
+            _steps_along(run, init)
+            return run.summary()
+        refuse_wrong_start(out, resume=resume)
+        with FolderLock(out):
+            remove_partials(out)
+            run.begin(init=init)
+            try:
+                _steps(run, report, on_save or _draw_nothing, should_stop)
+            finally:
+                run.close()
+        team.wait()
     return run.summary()
+
+
+def _train_along(config: TrainConfig, data: Path, out: Path, device: str, init: Path | None, team: Team) -> None:
+    """What the other processes of a team do."""
+    _steps_along(_Run(config, open_store(data), out, pick_device(device), {}, team), init)
+
+
+def _steps_along(run: "_Run", init: Path | None) -> None:
+    """The same steps as the first process, with nothing written; what stops that one stops this."""
+    run.start(init=init)
+    while not run.is_done():
+        run.one_step()
+        if run.is_stopped:
+            raise Interrupted
+    run.team.wait()
 
 
 def _steps(
@@ -124,7 +156,7 @@ def _steps(
     if is_done or (run.step > 0 and run.step % run.config.save_every == 0):
         on_save(run.model, run.step)  # a kill may have come between the checkpoint and its picture
     while not is_done:
-        figures = run.one_step()
+        figures = run.one_step(should_stop)
         is_done = run.is_done()  # asked once per step: the clock runs on
         if run.step % run.config.log_every == 0 or is_done:
             run.log(figures)
@@ -132,7 +164,7 @@ def _steps(
         if run.step % run.config.save_every == 0 or is_done:
             run.save()
             on_save(run.model, run.step)
-        if not is_done and should_stop():
+        if not is_done and run.is_stopped:
             run.save_state()
             raise Interrupted
 
@@ -160,8 +192,9 @@ class _Run:
         out: Path,
         device: torch.device,
         provenance: dict[str, Any],
+        team: Team,
     ) -> None:
-        self.config, self.out, self.device, self.provenance = config, out, device, provenance
+        self.config, self.out, self.device, self.provenance, self.team = config, out, device, provenance, team
         patch_ids = store.patch_ids(kept=True, split=config.split, part="train" if config.split else "all")
         if not patch_ids:
             raise InputError(f"{store.path}: no kept patch in the training part of split {config.split!r}")
@@ -170,6 +203,7 @@ class _Run:
         self.starts_from = ""
         self.optimizer = torch.optim.RAdam(self.model.parameters(), lr=config.schedule.first, eps=1e-8)
         self.step, self.seconds, self.psnr, self.rays_per_s = 0, 0.0, math.nan, 0.0
+        self.is_stopped = False
         cache = PatchCache(store, self.model.encoder_side_px)
         self.sampler = StepSampler(
             cache,
@@ -181,18 +215,21 @@ class _Run:
         )
 
     def begin(self, *, init: Path | None) -> None:
-        """Put the first weights in place (the last checkpoint's if there is one), open the log, start the clocks."""
+        """Start, and open the log."""
+        self.start(init=init)
+        self.trainlog = TrainingLog(self.out, resume_step=self.step)
+        self.psnr = self.trainlog.last_row.get("psnr", math.nan)
+
+    def start(self, *, init: Path | None) -> None:
+        """Put the first weights in place (the last checkpoint's if there is one) and start the clock."""
         if (self.out / STATE).exists():
             self._restore(load_state(self.out))
         elif init is not None:
             self.starts_from = load_weights_of(init, self.model, self.config.model)
         else:
             self.starts_from = f"encoder from {self.model.load_pretrained_parts()}"
-        self.trainlog = TrainingLog(self.out, resume_step=self.step)
-        self.psnr = self.trainlog.last_row.get("psnr", math.nan)
         self._resumed_step, self._resumed_seconds = self.step, self.seconds
         self._started = time.monotonic()
-        self._processor_started = time.process_time()
 
     def _restore(self, state: TrainingState) -> None:
         state.into(self.model, self.optimizer)
@@ -201,7 +238,7 @@ class _Run:
     def fraction(self) -> float:
         """Share of the run's budget that is spent."""
         if self.config.minutes is not None:
-            return min(1.0, self._elapsed() / (60 * self.config.minutes))
+            return min(1.0, self.seconds / (60 * self.config.minutes))
         return self.step / self.config.steps
 
     def is_done(self) -> bool:
@@ -210,21 +247,25 @@ class _Run:
     def progress(self) -> tuple[int, int]:
         """(done, total) for a progress bar: steps, or seconds of a run by time."""
         if self.config.minutes is not None:
-            return round(self._elapsed()), round(60 * self.config.minutes)
+            return round(self.seconds), round(60 * self.config.minutes)
         return self.step, self.config.steps
 
     def _elapsed(self) -> float:
         return self._resumed_seconds + time.monotonic() - self._started
 
-    def one_step(self) -> dict[str, float]:
-        """Encode, trace, compare, update; returns the loss terms."""
+    def one_step(self, should_stop: Callable[[], bool] = lambda: False) -> dict[str, float]:
+        """Encode, trace, compare, update; returns the loss terms (the whole team's).
+
+        Time and stops are the first process's, so that all follow one schedule and end at one step.
+        """
         config = self.config
         rate = learning_rate(config.schedule, self.step, self.fraction())
         for group in self.optimizer.param_groups:
             group["lr"] = rate
-        patches, pixels = self.sampler.batch(self.step, config.rays_per_patch)
+        rows = self.team.share(config.patches_per_step)
+        patches, pixels = self.sampler.batch(self.step, config.rays_per_patch, rows)
         patches, pixels = patches.to(self.device), pixels.to(self.device)
-        jitter = generator_for(config.seed, self.step, "jitter")
+        jitter = generator_for(config.seed, self.step, "jitter", self.team.rank)
 
         self.model.train()
         with autocast(config.precision, self.device):
@@ -233,17 +274,23 @@ class _Run:
         counts = pixels.is_known & to_canonical(pixels.rays, pixels.box).hit
         terms = training_loss(renderings, pixels.rgb, pixels.alpha, counts, config.loss)
         loss = torch.stack(list(terms.values())).sum()
-        figures = {name: float(term.detach()) for name, term in terms.items()}
-        self._refuse_nan(figures, patches.instance_ids)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
+        values = [float(term.detach()) for term in terms.values()]
+        seen = masked_psnr(renderings[-1], pixels.rgb, pixels.alpha * counts)
+        (*values, self.psnr), (self.seconds, stops) = self.team.average(
+            list(self.model.parameters()),
+            weight=float(counts.sum()),
+            means=[*values, seen],
+            from_first=[self._elapsed(), float(should_stop())],
+        )
+        figures, self.is_stopped = dict(zip(terms, values, strict=True)), stops > 0
+        self._refuse_nan(figures, patches.instance_ids)
         if config.clip_gradient is not None:
             torch.nn.utils.clip_grad_norm_(self.model.parameters(), config.clip_gradient)
         self.optimizer.step()
 
         self.step += 1
-        self.seconds = self._elapsed()
-        self.psnr = masked_psnr(renderings[-1], pixels.rgb, pixels.alpha * counts)
         steps_here = self.step - self._resumed_step
         rays = steps_here * config.patches_per_step * config.rays_per_patch
         self.rays_per_s = rays / max(time.monotonic() - self._started, 1e-9)
