@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from carstudio.cli import run
-from carstudio.commands.fit import objective, photographs_of
+from carstudio.commands.fit import photographs_of
 from carstudio.commands.opening import open_car
 from carstudio.dataset.pixels import PatchCache
 from carstudio.dataset.store import PatchStore
@@ -17,6 +17,7 @@ from carstudio.fitting.optimise import FitConfig, FitPixels, Fitted, field_param
 from carstudio.models.interface import CategoryModel, Latents
 from carstudio.training.batches import generator_for, patch_batch, pixel_batch
 from carstudio.training.checkpoint import load_model
+from carstudio.training.patch_fitting import objective
 from carstudio.training.trainer import train
 from training.toy import TINY, toy_store
 
