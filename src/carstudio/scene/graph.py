@@ -74,8 +74,9 @@ class CarRef:
 class Track:
     """One object through the log. `car` is what it looks like when it is drawn; None: never lifted.
 
-    `is_drawn` False leaves the object to the photograph (nobody has touched it); True draws it. `labels` keeps the
-    source's own record per frame.
+    `is_drawn` False leaves the object to the photograph (nobody has touched it); True draws it, in all its frames or in
+    those of `drawn_in` (an edit of frames 5-10 leaves frame 4 to the photograph). `labels` keeps the source's own record
+    per frame.
     """
 
     track_id: str
@@ -83,11 +84,16 @@ class Track:
     boxes: Mapping[int, PlacedBox] = field(default_factory=dict)  # by frame index
     car: CarRef | None = None
     is_drawn: bool = False
+    drawn_in: frozenset[int] | None = None  # None: all frames it has a box in
     labels: Mapping[int, Mapping[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "boxes", MappingProxyType(dict(self.boxes)))
         object.__setattr__(self, "labels", MappingProxyType(dict(self.labels)))
+
+    def is_drawn_at(self, frame: int) -> bool:
+        """Whether the track is drawn in the frame of that index, rather than left to the photograph or not there."""
+        return self.is_drawn and frame in self.boxes and (self.drawn_in is None or frame in self.drawn_in)
 
 
 @dataclass(frozen=True, kw_only=True)
