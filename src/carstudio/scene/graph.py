@@ -74,9 +74,9 @@ class CarRef:
 class Track:
     """One object through the log. `car` is what it looks like when it is drawn; None: never lifted.
 
-    `is_drawn` False leaves the object to the photograph (nobody has touched it); True draws it, in all its frames or in
-    those of `drawn_in` (an edit of frames 5-10 leaves frame 4 to the photograph). `labels` keeps the source's own record
-    per frame.
+    `is_drawn` False leaves the object to the photograph (nobody has touched it); True draws it, in all its frames or
+    in those of `drawn_in` (an edit of frames 5-10 leaves frame 4 to the photograph). `labels` keeps the source's own
+    record per frame.
     """
 
     track_id: str
