@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from carstudio.models.interface import _tiles_that_hit
+from carstudio.models.interface import tiles_that_hit
 from carstudio.rendering.gaussians import hits, tiles
 from carstudio.rendering.gaussians.cloud import GaussianCloud, splats_of
 from carstudio.rendering.gaussians.tracing import SplattingConfig, trace_cloud
@@ -14,7 +14,7 @@ from rendering.gaussian_scenes import camera, car_box, leaves, random_cloud, sur
 
 def tile_rays(side: int, dtype: torch.dtype = torch.float64) -> Rays:
     """Rays of an image in the order of 4 x 4 tiles."""
-    pixels = _tiles_that_hit(torch.ones(side, side, dtype=torch.bool), tiles.TILE_PX)
+    pixels = tiles_that_hit(torch.ones(side, side, dtype=torch.bool), tiles.TILE_PX)
     return image_rays(camera(side, dtype)).select(pixels)
 
 
@@ -57,7 +57,7 @@ def test_scattered_rays_are_no_tiles() -> None:
 @pytest.mark.parametrize("side", [1, 4])
 def test_touched_tiles_cover_all_hits_tile_by_tile(height: int, width: int, side: int) -> None:
     hit = torch.rand(height, width, generator=torch.Generator().manual_seed(height)) < 0.3
-    pixels = _tiles_that_hit(hit, side).unflatten(0, (-1, side * side))
+    pixels = tiles_that_hit(hit, side).unflatten(0, (-1, side * side))
     assert set(hit.flatten().nonzero().flatten().tolist()) <= set(pixels.flatten().tolist())
     for tile in pixels.tolist():
         places = {(pixel // width // side, pixel % width // side) for pixel in tile}

@@ -107,7 +107,7 @@ def render_image(
     x, y, width, height = window_of(box, camera)
     seen = camera.crop(x, y, width, height)
     rays = image_rays(seen)
-    hit = _tiles_that_hit(to_canonical(rays, box).hit.view(height, width), model.tile_px)
+    hit = tiles_that_hit(to_canonical(rays, box).hit.view(height, width), model.tile_px)
     part = rays.directions.new_zeros(width * height, 5)
     for rows in hit.split(chunk or model.chunk_rays) if len(hit) else ():
         found = model.render(rays.select(rows), latents, box)
@@ -138,7 +138,7 @@ def window_of(box: Box3D, camera: Camera) -> tuple[int, int, int, int]:
     return x0, y0, max(0, x1 - x0), max(0, y1 - y0)
 
 
-def _tiles_that_hit(hit: Bool[Tensor, "height width"], side: int) -> Int[Tensor, " pixel"]:
+def tiles_that_hit(hit: Bool[Tensor, "height width"], side: int) -> Int[Tensor, " pixel"]:
     """Pixel numbers of all side x side tiles with a hit, tile by tile; tiles at the edge repeat their pixels."""
     height, width = hit.shape
     padded = torch.nn.functional.pad(hit, (0, -width % side, 0, -height % side))
