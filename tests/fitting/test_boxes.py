@@ -17,7 +17,7 @@ from carstudio.rendering.rays import image_rays
 from carstudio.rendering.volume import Rendering
 
 CAMERA = Camera(torch.tensor([700.0, 700.0, 600.0, 180.0]), 1242, 375)
-ALL = BoxFreedom(pose=True, size=True)
+ALL = BoxFreedom(refine_pose=True, refine_size=True)
 
 
 def boxes() -> Box3D:
@@ -54,7 +54,7 @@ def test_a_car_that_grows_moves_away_and_looks_the_same() -> None:
     grown = math.exp(ALL.most_side * math.tanh(0.6))
     torch.testing.assert_close(found.size, boxes().size * grown)
     torch.testing.assert_close(pictured(found), pictured(boxes()), rtol=0, atol=2e-3)
-    alone = moved_boxes(boxes(), CARS, moves(car={0: 0.6}), BoxFreedom(size=True))
+    alone = moved_boxes(boxes(), CARS, moves(car={0: 0.6}), BoxFreedom(refine_size=True))
     assert torch.equal(alone.center, boxes().center)
     torch.testing.assert_close(alone.size[:, 0], boxes().size[:, 0] * grown)
     assert torch.equal(alone.size[:, 1:], boxes().size[:, 1:])
@@ -95,7 +95,7 @@ def test_nothing_leaves_its_bounds() -> None:
     assert float(angle.max()) <= ALL.most_turn_deg * 3**0.5 + 1e-3
     torch.testing.assert_close(found.rotation @ found.rotation.mT, torch.eye(3).expand(3, 3, 3), rtol=0, atol=1e-5)
     assert torch.equal(found.size[0], found.size[1]), "one car has one size"
-    assert float(prior_of(wild, ALL)) <= ALL.prior * (18 + 6)
+    assert float(prior_of(wild, ALL)) <= ALL.box_prior * (18 + 6)
 
 
 def test_lines_of_sight_turn_the_shortest_way() -> None:
@@ -131,7 +131,7 @@ def test_a_wrong_pose_is_found_again() -> None:
         found = renderings[-1]
         return (found.rgb - pixels.rgb).square().mean() + (found.opacity - pixels.alpha).square().mean()
 
-    freedom = BoxFreedom(pose=True, rate=0.05, prior=0.0)
+    freedom = BoxFreedom(refine_pose=True, box_rate=0.05, box_prior=0.0)
     found = fit(model, latents, draw, objective, FitConfig(steps=60, latent_rate=0.0, box=freedom))
     assert found.box is not None
     assert torch.equal(found.latents.shape, latents.shape)
@@ -150,7 +150,8 @@ def test_a_wrong_pose_is_found_again() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"most_shift": -0.1}, {"most_side": 2.0}, {"most_turn_deg": 90.0}, {"rate": -1.0}, {"prior": -1.0}]
+    "wrong",
+    [{"most_shift": -0.1}, {"most_side": 2.0}, {"most_turn_deg": 90.0}, {"box_rate": -1.0}, {"box_prior": -1.0}],
 )
 def test_absurd_bounds_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(InputError, match="box freedom"):

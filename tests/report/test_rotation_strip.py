@@ -17,7 +17,7 @@ def test_a_strip_is_the_car_at_other_yaws() -> None:
     latents = Latents(torch.zeros(1, 128), torch.zeros(1, 128))
     camera = Camera(torch.tensor([90.0, 90.0, 32.0, 24.0]), 64, 48)
 
-    def box(yaw: float):  # noqa: ANN202
+    def box(yaw: float):
         bottom, size = torch.tensor([[0.2, 1.2, 8.0]]), torch.tensor([[4.2, 1.5, 1.8]])
         return box_from_kitti(bottom, size, torch.tensor([yaw]))
 

@@ -22,10 +22,10 @@ from carstudio.geometry.transforms import rotation_from_quaternion
 class BoxFreedom:
     """What of a box may change, and by how much at most."""
 
-    pose: bool = False
-    """Place and rotation, for each photograph."""
-    size: bool = False
-    """Length, height and width, for each car."""
+    refine_pose: bool = False
+    """Refine place and rotation, for each photograph."""
+    refine_size: bool = False
+    """Refine length, height and width, for each car."""
     most_shift: float = 0.1
     """Across the line of sight, in lengths of the car."""
     most_turn_deg: float = 8.0
@@ -34,17 +34,17 @@ class BoxFreedom:
     """Change of the apparent size (its logarithm)."""
     most_side: float = 0.1
     """Change of each side (its logarithm)."""
-    rate: float = 0.03
+    box_rate: float = 0.03
     """Learning rate (Adam), in shares of these bounds."""
-    prior: float = 2e-4
+    box_prior: float = 2e-4
     """Loss of a number at its bound: what the photographs do not speak for stays where it was."""
 
     def __post_init__(self) -> None:
         bounds = (self.most_shift, self.most_apparent, self.most_side)
         if not all(0 <= bound <= 1 for bound in bounds) or not 0 <= self.most_turn_deg <= 45:
             raise InputError("box freedom: bounds must be 0 to 1, turns 0 to 45 degrees")
-        if self.rate < 0 or self.prior < 0:
-            raise InputError("box freedom: rate and prior must be 0 or more")
+        if self.box_rate < 0 or self.box_prior < 0:
+            raise InputError("box freedom: box_rate and box_prior must be 0 or more")
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,11 @@ def moved_boxes(box: Box3D, car: Int[Tensor, " photo"], moves: BoxMoves, freedom
     The turn is the one that the camera sees: shifted across the line of sight, a car turns along with it, so that its
     picture moves and stays the same.
     """
-    photo, sides = torch.tanh(moves.photo), torch.tanh(moves.car)[car] * (freedom.most_side if freedom.size else 0.0)
-    if not freedom.pose:
+    photo, sides = (
+        torch.tanh(moves.photo),
+        torch.tanh(moves.car)[car] * (freedom.most_side if freedom.refine_size else 0.0),
+    )
+    if not freedom.refine_pose:
         return Box3D(box.center, box.size * sides.exp(), box.rotation)
     shift, turn, apparent = photo.split([2, 3, 1], dim=-1)
     distance = box.center.norm(dim=-1, keepdim=True)
@@ -95,5 +98,5 @@ def shortest_rotation(a: Float[Tensor, "*batch 3"], b: Float[Tensor, "*batch 3"]
 
 
 def prior_of(moves: BoxMoves, freedom: BoxFreedom) -> Float[Tensor, ""]:
-    """Loss of the moves: `freedom.prior` for each number at its bound, summed, so that cars do not share it."""
-    return freedom.prior * (torch.tanh(moves.photo).square().sum() + torch.tanh(moves.car).square().sum())
+    """Loss of the moves: `freedom.box_prior` for each number at its bound, summed, so that cars do not share it."""
+    return freedom.box_prior * (torch.tanh(moves.photo).square().sum() + torch.tanh(moves.car).square().sum())

@@ -7,7 +7,7 @@ Boxes may be refined along with them (`boxes`).
 import copy
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import torch
@@ -59,19 +59,34 @@ class FitPixels:
     counts: Bool[Tensor, "photo ray"]
     car: Int[Tensor, " photo"]
 
+    def select(self, rows: Bool[Tensor, " photo"]) -> "FitPixels":
+        """Some of the photographs."""
+        rays = Rays(self.rays.origins[rows], self.rays.directions[rows], self.rays.radii[rows])
+        box = Box3D(self.box.center[rows], self.box.size[rows], self.box.rotation[rows])
+        return FitPixels(rays, box, self.rgb[rows], self.alpha[rows], self.counts[rows], self.car[rows])
+
+
+Curve = tuple[tuple[int, float], ...]
+
 
 @dataclass(frozen=True)
 class Fitted:
-    """Latents of all cars, changed weights (empty where the model stayed), held-out losses (steps done, value).
+    """Latents of all cars, changed weights (empty where the model stayed), steps that were made.
 
-    `box` are the refined boxes of all photographs, where boxes were refined.
+    `curves` are the held-out losses (steps done, value) of each car; `box` the refined boxes of all photographs, where
+    boxes were refined.
     """
 
     latents: Latents
     weights: dict[str, Tensor]
-    curve: tuple[tuple[int, float], ...]
+    curves: tuple[Curve, ...]
     steps: int
     box: Box3D | None = None
+
+    @property
+    def curve(self) -> Curve:
+        """Held-out losses of all cars together."""
+        return tuple((points[0][0], sum(value for _, value in points)) for points in zip(*self.curves, strict=True))
 
 
 Objective = Callable[[tuple[Rendering, ...], FitPixels], Float[Tensor, ""]]
@@ -130,15 +145,16 @@ class _State:
         )
         self.photos, self.given = pixels.car, pixels.box
         self.moves = BoxMoves.none(len(pixels.car), len(start.shape), start.shape)
-        self.moves.photo.requires_grad_(freedom.pose)
-        self.moves.car.requires_grad_(freedom.size)
+        self.moves.photo.requires_grad_(freedom.refine_pose)
+        self.moves.car.requires_grad_(freedom.refine_size)
 
     @property
     def moves_boxes(self) -> bool:
-        return self.freedom.pose or self.freedom.size
+        return self.freedom.refine_pose or self.freedom.refine_size
 
     def tensors(self) -> list[Tensor]:
-        return [*self.codes, *self.weights.values(), self.moves.photo, self.moves.car]
+        """Codes of shape and texture, moves by photograph, moves by car, then the weights."""
+        return [*self.codes, self.moves.photo, self.moves.car, *self.weights.values()]
 
     @property
     def codes(self) -> list[Tensor]:
@@ -149,24 +165,39 @@ class _State:
         if self.weights:
             groups.append({"params": list(self.weights.values()), "lr": config.field_rate})
         moved = [part for part in (self.moves.photo, self.moves.car) if part.requires_grad]
-        return groups + ([{"params": moved, "lr": config.box.rate}] if moved else [])
+        return groups + ([{"params": moved, "lr": config.box.box_rate}] if moved else [])
 
     def loss(self, pixels: FitPixels, objective: Objective) -> Float[Tensor, ""]:
+        renderings, pixels = self._shown(pixels)
+        loss = objective(renderings, pixels)
+        return loss + prior_of(self.moves, self.freedom) if self.moves_boxes else loss
+
+    @torch.no_grad()
+    def loss_of_each(self, pixels: FitPixels, objective: Objective) -> list[float]:
+        """Losses of the cars, each by itself, without priors."""
+        renderings, pixels = self._shown(pixels)
+        values = []
+        for car in range(len(self.latents.shape)):
+            rows = pixels.car == car
+            own = tuple(select_rows(rendering, rows) for rendering in renderings)
+            values.append(float(objective(own, pixels.select(rows))))
+        return values
+
+    def _shown(self, pixels: FitPixels) -> tuple[tuple[Rendering, ...], FitPixels]:
         box = pixels.box
         if self.moves_boxes:
             box = moved_boxes(box, pixels.car, self.moves, self.freedom)
             pixels = replace(pixels, box=Box3D(box.center.detach(), box.size.detach(), box.rotation.detach()))
         of_photos = Latents(self.latents.shape[pixels.car], self.latents.texture[pixels.car])
-        loss = objective(self.model.render_levels(pixels.rays, of_photos, box), pixels)
-        return loss + prior_of(self.moves, self.freedom) if self.moves_boxes else loss
+        return self.model.render_levels(pixels.rays, of_photos, box), pixels
 
     def fitted(self, best: "_Best", steps: int) -> Fitted:
-        shape, texture, *rest = best.values
-        weights, moves = rest[: len(self.weights)], BoxMoves(rest[-2], rest[-1])
+        shape, texture, photo, car, *weights = best.tensors
+        moves = BoxMoves(photo, car)
         return Fitted(
             Latents(shape, texture),
             dict(zip(self.weights, weights, strict=True)),
-            tuple(best.curve),
+            tuple(tuple(curve) for curve in best.curves),
             steps,
             moved_boxes(self.given, self.photos, moves, self.freedom) if self.moves_boxes else None,
         )
@@ -182,14 +213,14 @@ def _descend(
     report: Report,
 ) -> Fitted:
     optimizer = torch.optim.Adam(state.groups(config))
-    best = _Best(state)
+    best = _Best(state, config.patience)
     done = 0
     for step in range(config.steps):
         if watch is not None:
             watch(step, state.model, state.latents)
         if held_out is not None and step % config.look_every == 0:
-            best.look(step, float(state.loss(held_out, objective).detach()), state)
-            if best.misses >= config.patience:
+            best.look(step, state.loss_of_each(held_out, objective))
+            if best.is_past:
                 break
         loss = state.loss(draw(step), objective)
         optimizer.zero_grad(set_to_none=True)
@@ -200,9 +231,9 @@ def _descend(
     if watch is not None and done == config.steps:
         watch(done, state.model, state.latents)
     if held_out is None:
-        best.take(state)
-    elif best.misses < config.patience:
-        best.look(done, float(state.loss(held_out, objective).detach()), state)
+        best.take_all()
+    elif not best.is_past:
+        best.look(done, state.loss_of_each(held_out, objective))
     return state.fitted(best, done)
 
 
@@ -217,21 +248,48 @@ def known_hits(pixels: FitPixels) -> Bool[Tensor, "photo ray"]:
     return pixels.counts & to_canonical(pixels.rays, pixels.box).hit
 
 
+def select_rows(rendering: Rendering, rows: Tensor) -> Rendering:
+    """Some batch entries of a rendering."""
+    return Rendering(**{part.name: getattr(rendering, part.name)[rows] for part in fields(Rendering)})
+
+
 class _Best:
-    """The state that explained the held-out pixels best."""
+    """What explained the held-out pixels best: of each car by itself, or of all together where they share the field."""
 
-    def __init__(self, state: _State) -> None:
-        self.value, self.misses = math.inf, 0
-        self.curve: list[tuple[int, float]] = []
-        self.take(state)
+    def __init__(self, state: _State, patience: int) -> None:
+        self.state, self.patience = state, patience
+        num_cars = len(state.latents.shape)
+        self.curves: list[list[tuple[int, float]]] = [[] for _ in range(num_cars)]
+        self.groups = [range(num_cars)] if state.weights else [range(car, car + 1) for car in range(num_cars)]
+        self.values, self.misses = [math.inf] * len(self.groups), [0] * len(self.groups)
+        self.take_all()
 
-    def look(self, step: int, value: float, state: _State) -> None:
-        self.curve.append((step, value))
-        if value < self.value:
-            self.value, self.misses = value, 0
-            self.take(state)
-        else:
-            self.misses += 1
+    @property
+    def is_past(self) -> bool:
+        """Whether no car has become better for long."""
+        return all(misses >= self.patience for misses in self.misses)
 
-    def take(self, state: _State) -> None:
-        self.values = [tensor.detach().clone() for tensor in state.tensors()]
+    def look(self, step: int, losses: list[float]) -> None:
+        for curve, loss in zip(self.curves, losses, strict=True):
+            curve.append((step, loss))
+        for index, group in enumerate(self.groups):
+            value = sum(losses[car] for car in group)
+            if self.misses[index] >= self.patience:
+                continue  # alone, this one would have stopped
+            if value < self.values[index]:
+                self.values[index], self.misses[index] = value, 0
+                self._take(group)
+            else:
+                self.misses[index] += 1
+
+    def take_all(self) -> None:
+        self.tensors = [tensor.detach().clone() for tensor in self.state.tensors()]
+
+    def _take(self, group: range) -> None:
+        if self.state.weights:
+            self.take_all()
+            return
+        photos = torch.isin(self.state.photos, torch.tensor(list(group), device=self.state.photos.device))
+        for place, (kept, now) in enumerate(zip(self.tensors, self.state.tensors(), strict=True)):
+            rows = photos if place == 2 else slice(group.start, group.stop)
+            kept[rows] = now.detach()[rows]

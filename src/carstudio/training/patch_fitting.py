@@ -1,12 +1,11 @@
 """Fitting cars to their prepared patches: `fitting.optimise` with pixels of patches and our loss."""
 
 from collections.abc import Sequence
-from dataclasses import fields
 
 import torch
 
 from carstudio.dataset.pixels import PreparedPatch
-from carstudio.fitting.optimise import FitConfig, FitPixels, Fitted, Watch, fit, known_hits
+from carstudio.fitting.optimise import FitConfig, FitPixels, Fitted, Watch, fit, known_hits, select_rows
 from carstudio.models.interface import CategoryModel, Latents
 from carstudio.progress import Report, silent
 from carstudio.rendering.volume import Rendering
@@ -85,8 +84,3 @@ def objective(renderings: tuple[Rendering, ...], pixels: FitPixels) -> torch.Ten
         terms = training_loss(own, pixels.rgb[rows], pixels.alpha[rows], counts[rows], LossConfig(colour="whole-crop"))
         losses += list(terms.values())
     return torch.stack(losses).sum()
-
-
-def select_rows(rendering: Rendering, rows: torch.Tensor) -> Rendering:
-    """Some batch entries of a rendering."""
-    return Rendering(**{part.name: getattr(rendering, part.name)[rows] for part in fields(Rendering)})
