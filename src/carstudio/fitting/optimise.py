@@ -81,6 +81,8 @@ def fit(
     take the same steps alone as in company. The model given is left as it is; where `field_rate` is above 0 a copy is
     fitted and its changed weights are returned.
     """
+    if not model.is_coded:
+        raise InputError("this model has no codes to fit: it looks a car up in its photo; fit one that has")
     shape, texture = start.shape.detach().clone(), start.texture.detach().clone()
     if config.steps == 0:
         return Fitted(Latents(shape, texture), {}, (), 0)
@@ -128,7 +130,7 @@ def _descend(
         best.take(codes, weights)
     elif best.misses < config.patience:
         best.look(done, float(_loss(model, latents, held_out, objective).detach()), codes, weights)
-    return Fitted(Latents(*best.codes), best.weights, tuple(best.curve), done)
+    return Fitted(Latents(best.codes[0], best.codes[1]), best.weights, tuple(best.curve), done)
 
 
 def field_parameters(model: CategoryModel) -> list[tuple[str, torch.nn.Parameter]]:
