@@ -111,6 +111,8 @@ def fit(
     fitted and its changed weights are returned. `watch(steps done, model, latents)` sees the state before every step
     and after the last one.
     """
+    if not model.is_coded:
+        raise InputError("this model has no codes to fit: it looks a car up in its photo; fit one that has")
     if config.steps == 0:
         if watch is not None:
             watch(0, model, start)
