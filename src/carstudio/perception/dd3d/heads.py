@@ -5,7 +5,7 @@ own learned scales of what is predicted. All 3-D quantities are predicted once p
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Float
@@ -35,6 +35,10 @@ class HeadOutputs:
     size: Float[Tensor, "batch three_classes rows columns"]  # width, length, height: before tanh, of the class's own
     confidence: Float[Tensor, "batch classes rows columns"]  # logit
 
+    def to(self, device: torch.device | str) -> "HeadOutputs":
+        """The same on another device."""
+        return HeadOutputs(*(getattr(self, field.name).to(device) for field in fields(self)))
+
 
 class Scale(nn.Module):
     """A learned factor."""
@@ -50,6 +54,28 @@ class Offset(nn.Module):
     def __init__(self, value: float) -> None:
         super().__init__()
         self.bias = nn.Parameter(torch.tensor([value]))
+
+
+class Scales(nn.ModuleList):
+    """A learned factor per level."""
+
+    def __init__(self, values: Sequence[float]) -> None:
+        super().__init__(Scale(float(value)) for value in values)
+
+    def of_level(self, level: int) -> Float[Tensor, "1"]:
+        """The level's factor."""
+        return self.get_parameter(f"{level}.scale")
+
+
+class Offsets(nn.ModuleList):
+    """A learned summand per level."""
+
+    def __init__(self, values: Sequence[float]) -> None:
+        super().__init__(Offset(value) for value in values)
+
+    def of_level(self, level: int) -> Float[Tensor, "1"]:
+        """The level's summand."""
+        return self.get_parameter(f"{level}.bias")
 
 
 class SharedConv(nn.Conv2d):
@@ -87,11 +113,6 @@ def predictor(outputs: int, *, bias: bool = True) -> nn.Conv2d:
     return nn.Conv2d(CHANNELS, outputs, 3, padding=1, bias=bias)
 
 
-def scales(values: Sequence[float]) -> nn.ModuleList:
-    """One learned factor per level."""
-    return nn.ModuleList(Scale(float(value)) for value in values)
-
-
 class FCOS2DHead(nn.Module):
     """Classes, centerness and distances to the sides of the 2-D box (Tian et al., "FCOS", ICCV 2019)."""
 
@@ -102,7 +123,7 @@ class FCOS2DHead(nn.Module):
         self.cls_logits = predictor(num_classes)
         self.box2d_reg = predictor(4)
         self.centerness = predictor(1)
-        self.scales_box2d_reg = scales(strides)
+        self.scales_box2d_reg = Scales(strides)
 
 
 class FCOS3DHead(nn.Module):
@@ -121,11 +142,11 @@ class FCOS3DHead(nn.Module):
         self.box3d_depth = nn.ModuleList([predictor(num_classes, bias=False)])
         self.box3d_size = nn.ModuleList([predictor(3 * num_classes)])
         self.box3d_conf = nn.ModuleList([predictor(num_classes)])
-        self.scales_proj_ctr = scales(strides)
-        self.scales_size = scales([1.0] * NUM_LEVELS)
-        self.scales_conf = scales([1.0] * NUM_LEVELS)
-        self.scales_depth = scales([0.3 * std for std in DEPTH_STD])
-        self.offsets_depth = nn.ModuleList(Offset(mean) for mean in DEPTH_MEAN)
+        self.scales_proj_ctr = Scales(strides)
+        self.scales_size = Scales([1.0] * NUM_LEVELS)
+        self.scales_conf = Scales([1.0] * NUM_LEVELS)
+        self.scales_depth = Scales([0.3 * std for std in DEPTH_STD])
+        self.offsets_depth = Offsets(DEPTH_MEAN)
 
 
 def look(
@@ -141,13 +162,13 @@ def look(
             HeadOutputs(
                 logits=head2d.cls_logits(of_class),
                 centerness=head2d.centerness(of_box2d),
-                box2d=nn.functional.relu(head2d.box2d_reg(of_box2d) * head2d.scales_box2d_reg[level].scale),
+                box2d=nn.functional.relu(head2d.box2d_reg(of_box2d) * head2d.scales_box2d_reg.of_level(level)),
                 quaternion=head3d.box3d_quat[0](of_box3d),
-                center=head3d.box3d_ctr[0](of_box3d) * head3d.scales_proj_ctr[level].scale,
-                depth=head3d.box3d_depth[0](of_box3d) * head3d.scales_depth[level].scale
-                + head3d.offsets_depth[level].bias,
-                size=head3d.box3d_size[0](of_box3d) * head3d.scales_size[level].scale,
-                confidence=head3d.box3d_conf[0](of_box3d) * head3d.scales_conf[level].scale,
+                center=head3d.box3d_ctr[0](of_box3d) * head3d.scales_proj_ctr.of_level(level),
+                depth=head3d.box3d_depth[0](of_box3d) * head3d.scales_depth.of_level(level)
+                + head3d.offsets_depth.of_level(level),
+                size=head3d.box3d_size[0](of_box3d) * head3d.scales_size.of_level(level),
+                confidence=head3d.box3d_conf[0](of_box3d) * head3d.scales_conf.of_level(level),
             )
         )
     return outputs

@@ -1,6 +1,5 @@
 """Convolutions that are followed by a normalisation, and the one that has swallowed it."""
 
-from collections.abc import Callable
 from itertools import pairwise
 
 import torch
@@ -57,17 +56,18 @@ def folded(conv: nn.Conv2d, norm: nn.Module) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def fold_norms(network: nn.Module) -> None:
-    """Let every convolution with a normalisation of its own swallow it, in place; results change in last digits."""
+    """Let every convolution swallow the frozen normalisation that follows it, in place; last digits change."""
     for module in network.modules():
         if isinstance(module, NormedConv):
-            _swallow(module, module.norm, lambda module=module: setattr(module, "norm", nn.Identity()))
+            _swallow(module, module.norm)
+            module.norm = nn.Identity()
         elif isinstance(module, nn.Sequential):
             for (_, conv), (name, norm) in pairwise(list(module.named_children())):
                 if isinstance(conv, nn.Conv2d) and isinstance(norm, FrozenBatchNorm):
-                    _swallow(conv, norm, lambda module=module, name=name: setattr(module, name, nn.Identity()))
+                    _swallow(conv, norm)
+                    module.add_module(name, nn.Identity())
 
 
-def _swallow(conv: nn.Conv2d, norm: nn.Module, forget_norm: Callable[[], None]) -> None:
+def _swallow(conv: nn.Conv2d, norm: nn.Module) -> None:
     weight, bias = folded(conv, norm)
     conv.weight, conv.bias = nn.Parameter(weight), nn.Parameter(bias)
-    forget_norm()
