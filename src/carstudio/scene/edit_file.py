@@ -75,10 +75,8 @@ def _edit(entry: Any, index: int, lines: dict[Path_, int], name: str) -> Edit:
     except ValidationError as error:
         first = _clearest(error)
         inner = tuple(part for part in first["loc"] if part != op)
-        raise InputError(
-            f"{name} line {_line(at, inner, lines)}: {op}: {_field_name(inner)}{first['msg'].removeprefix('Value error, ')}"
-            f"{_found(first, inner, entry)}"
-        ) from error
+        said = f"{op}: {_field_name(inner)}{first['msg'].removeprefix('Value error, ')}{_found(first, inner)}"
+        raise InputError(f"{name} line {_line(at, inner, lines)}: {said}") from error
     own = {str(key[2]): line for key, line in lines.items() if key[:2] == at and len(key) == 3}
     edit.came_from(name, {"op": lines[at], **own})
     return edit
@@ -117,7 +115,7 @@ def _field_name(inner: tuple[Any, ...]) -> str:
     return f"{'.'.join(parts)}: " if parts else ""
 
 
-def _found(error: Any, inner: tuple[Any, ...], entry: dict[str, Any]) -> str:
+def _found(error: Any, inner: tuple[Any, ...]) -> str:
     if error["type"] == "missing" or not inner:
         return ""
     return f", found {shortened(error.get('input'))}"

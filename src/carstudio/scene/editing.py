@@ -303,7 +303,7 @@ def warnings_of(before: Scene, after: Scene, around: Surroundings) -> list[str]:
         for index in sorted(changed):
             box, frame = track.boxes[index], frames[index]
             x, y, z = standing(box).tolist()
-            if abs(y - around.ground.height(frame, x, z)) > _OFF_GROUND_M:
+            if abs(y - around.terrain.height(frame, x, z)) > _OFF_GROUND_M:
                 off.append(index)
             if is_in_view(box, frame):
                 seen.append(index)

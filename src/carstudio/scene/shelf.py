@@ -20,7 +20,7 @@ _KEPT_FILES = (TENSORS, DESCRIPTION, PATCH, PATCH_MASK, PATCH_DESCRIPTION)
 
 @dataclass(frozen=True)
 class CarShelf:
-    """The folder `scene_folder/cars`. `models`: more models that cars may be made with; `more`: CAR folders from outside."""
+    """The folder `scene_folder/cars`; further models that cars may be made with; CAR folders from outside (`more`)."""
 
     scene_folder: Path
     models: tuple[Path, ...] = ()

@@ -3,13 +3,14 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from carstudio.errors import InputError
 from carstudio.scene.edits import AxesName, Place
 from carstudio.scene.graph import PlacedBox, Scene, SceneFrame, Vector3
-from carstudio.scene.ground import CAMERA_HEIGHT_M, Ground, ground_of
+from carstudio.scene.terrain import CAMERA_HEIGHT_M, Terrain, terrain_of
 from carstudio.scene.path import EgoPath, ego_path
 from carstudio.scene.places import Pose, box_standing, heading, pose_of, turn_y, world_from_camera
 
@@ -19,12 +20,12 @@ class Surroundings:
     """What edits need to know of a scene beside its tracks; made once, before the first edit."""
 
     path: EgoPath | None
-    ground: Ground
+    terrain: Terrain
 
 
 def surroundings_of(scene: Scene) -> Surroundings:
     """The ego path and the ground of a scene."""
-    return Surroundings(ego_path(scene), ground_of(scene))
+    return Surroundings(ego_path(scene), terrain_of(scene))
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def boxes_along(
     that a car that stands stays where it is. `car` places are relative to the track's `own` box at that frame.
     """
     spots = [_spot(place) for place in sorted(places, key=lambda place: place.at)]
-    for before, after in zip(spots, spots[1:], strict=False):
+    for before, after in pairwise(spots):
         if before.at == after.at:
             raise InputError(f"two poses at frame {after.at}; leave one out")
     if axes == "car":
@@ -101,7 +102,7 @@ def _with_way(spot: _Spot, start: _Spot, end: _Spot) -> _Spot:
 def _box(spot: _Spot, axes: AxesName, frame: SceneFrame, size: Vector3, around: Surroundings) -> PlacedBox:
     rotation, bottom = _in_camera(spot, axes, frame, around)
     if spot.y is None:
-        bottom = np.array([bottom[0], around.ground.height(frame, bottom[0], bottom[2]), bottom[2]])
+        bottom = np.array([bottom[0], around.terrain.height(frame, bottom[0], bottom[2]), bottom[2]])
     return box_standing(rotation, bottom, size)
 
 
@@ -158,7 +159,7 @@ def _from_car(spot: _Spot, own: dict[int, PlacedBox]) -> _Spot:
 def _to_world(spot: _Spot, scene: Scene, around: Surroundings) -> _Spot:
     frame = scene.frame(spot.at)
     pose = need_pose(frame, "camera")
-    low = around.ground.height(frame, spot.x, spot.z) if spot.y is None else spot.y
+    low = around.terrain.height(frame, spot.x, spot.z) if spot.y is None else spot.y
     point = pose[:3, :3] @ np.array([spot.x, low, spot.z]) + pose[:3, 3]
     yaw = None if spot.yaw_rad is None else heading(pose[:3, :3] @ turn_y(spot.yaw_rad))
     return _Spot(spot.at, float(point[0]), None if spot.y is None else float(point[1]), float(point[2]), yaw)

@@ -19,7 +19,7 @@ _TILT_WEIGHT = 20.0  # m^2: how far samples must spread before a slope is believ
 
 
 @dataclass(frozen=True)
-class Ground:
+class Terrain:
     """Points of the ground: in the world where the log has poses, else by frame in its camera's frame."""
 
     world: Float[np.ndarray, "n 3"]
@@ -47,7 +47,7 @@ class Ground:
         return (self.world - pose[:3, 3]) @ pose[:3, :3]
 
 
-def ground_of(scene: Scene) -> Ground:
+def terrain_of(scene: Scene) -> Terrain:
     """The ground of a scene, from labelled boxes that no edit has touched, and from its poses."""
     by_frame: dict[int, list[np.ndarray]] = {}
     world: list[np.ndarray] = []
@@ -61,4 +61,4 @@ def ground_of(scene: Scene) -> Ground:
             if pose is not None:
                 world.append(pose[:3, :3] @ bottom + pose[:3, 3])
     world += [pose[:3, 3] + pose[:3, 1] * CAMERA_HEIGHT_M for _, pose in posed_frames(scene)]
-    return Ground(np.array(world).reshape(-1, 3), {index: np.array(points) for index, points in by_frame.items()})
+    return Terrain(np.array(world).reshape(-1, 3), {index: np.array(points) for index, points in by_frame.items()})
