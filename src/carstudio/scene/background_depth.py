@@ -24,11 +24,10 @@ _DIAMOND = np.array([[0, 0, 1, 0, 0], [0, 1, 1, 1, 0], [1, 1, 1, 1, 1], [0, 1, 1
 
 def densified(sparse: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
     """Depth between LiDAR's points, inf where no point is near (about 12 px)."""
-    nearness = np.where(np.isfinite(sparse) & (sparse < FARTHEST_M), 1 / np.maximum(sparse, 0.1), 0.0).astype(
-        np.float32
-    )
-    nearness = cv2.dilate(nearness, _DIAMOND)
-    nearness = cv2.morphologyEx(nearness, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    known = np.isfinite(sparse) & (sparse < FARTHEST_M)
+    nearness = np.asarray(np.where(known, 1 / np.maximum(sparse, 0.1), 0.0), np.float32)
+    nearness = np.asarray(cv2.dilate(nearness, _DIAMOND))
+    nearness = np.asarray(cv2.morphologyEx(nearness, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)))
     for side in (7, 15, 25):
         wider = cv2.dilate(nearness, np.ones((side, side), np.uint8))
         nearness = np.where(nearness > 0, nearness, wider)
@@ -76,7 +75,6 @@ def is_ground(
     depth_m: Float[np.ndarray, "height width"], ground: Ground, camera: Camera
 ) -> Bool[np.ndarray, "height width"]:
     """Pixels whose depth puts them on the plane, or so little above it that a car would stand on them."""
-    height, width = depth_m.shape
     seen = np.isfinite(depth_m)
     above = np.full(depth_m.shape, np.inf)
     rows, columns = np.nonzero(seen)

@@ -68,9 +68,8 @@ def trace_object(model: CategoryModel, latents: Latents, box: Box3D, camera: Cam
 
 def _nothing(camera: Camera) -> TracedObject:
     none = camera.intrinsics.new_zeros(1, 0, 1)
-    return TracedObject(
-        torch.zeros(0, dtype=torch.long), Segments(none, none, none, none[..., None].expand(1, 0, 1, 3))
-    )
+    segments = Segments(none, none, none, none[..., None].expand(1, 0, 1, 3))
+    return TracedObject(torch.zeros(0, dtype=torch.long), segments)
 
 
 def _joined(parts: Sequence[Segments]) -> Segments:
@@ -103,8 +102,9 @@ def select_rays(segments: Segments, rows: Tensor) -> Segments:
 def merge_layers(
     objects: Sequence[TracedObject], background_m: Float[Tensor, " all_pixels"]
 ) -> tuple[ObjectLayer, ...]:
-    """The visible part of every object before an opaque background at `background_m` (distance along the ray, inf: none).
+    """The visible part of every object before an opaque background.
 
+    `background_m` is its distance along each pixel's ray, inf where there is none.
     The order of the objects matters only where segments of two lie at exactly the same distance.
     """
     count = len(background_m)
@@ -126,8 +126,10 @@ def _groups(has: Tensor) -> list[tuple[list[int], Tensor]]:
         return []
     keys = np.ascontiguousarray(np.packbits(has[:, touched].numpy(), axis=0).T)
     _, first, group = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    group = torch.from_numpy(group.reshape(-1))
-    return [(has[:, touched[int(first[i])]].nonzero()[:, 0].tolist(), touched[group == i]) for i in range(len(first))]
+    group_of = torch.from_numpy(group.reshape(-1))
+    return [
+        (has[:, touched[int(first[i])]].nonzero()[:, 0].tolist(), touched[group_of == i]) for i in range(len(first))
+    ]
 
 
 def _composited(
