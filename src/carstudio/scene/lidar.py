@@ -1,7 +1,6 @@
 """LiDAR points of a frame, or of its neighbours carried over by their poses, in the frame's camera."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,20 +12,12 @@ from carstudio.files import inside, read_bounded
 from carstudio.geometry.camera import Camera
 from carstudio.geometry.canonical import canonical_from_camera
 from carstudio.geometry.transforms import transform_points
+from carstudio.scene.frame_jobs import Neighbour
 from carstudio.scene.graph import PlacedBox, SceneFrame
 
 MAX_SCAN_BYTES = 64 * 1024 * 1024  # four million points: thirty times a scan of KITTI's
 _POINT_BYTES = 16  # x, y, z, reflectance, float32
 NEAREST_M = 0.5
-MOST_FRAMES_AWAY = 10  # farther scans see other streets, and poses drift
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scan:
-    """A frame that has a LiDAR file, and all that stood there: its points are not background."""
-
-    frame: SceneFrame
-    boxes: tuple[PlacedBox, ...]
 
 
 def read_scan(root: str, frame: SceneFrame) -> Float[np.ndarray, "n 3"]:
@@ -47,7 +38,7 @@ def read_scan(root: str, frame: SceneFrame) -> Float[np.ndarray, "n 3"]:
 
 
 def background_points(
-    root: str, frame: SceneFrame, gone: Sequence[PlacedBox], scans: Sequence[Scan]
+    root: str, frame: SceneFrame, gone: Sequence[PlacedBox], scans: Sequence[Neighbour]
 ) -> Float[np.ndarray, "n 3"] | None:
     """Points of what stands still, camera frame: of the frame's own scan, else of its neighbours'; None without any.
 
