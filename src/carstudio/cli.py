@@ -38,6 +38,7 @@ VERBS = {
     "fit": ("carstudio.commands.fit:Fit", "trained model + photos of one car -> that car, in a file"),
     "export": ("carstudio.commands.export:Export", "car -> GLB or splat PLY"),
     "render": ("carstudio.commands.render:Render", "trained model + photos -> turntables, opacity, depth"),
+    "scene": ("carstudio.commands.scene:Scenes", "driving log -> frames and cars to edit"),
     "models": ("carstudio.commands.models:Models", "pretrained networks: which there are, which are here, download"),
     "doctor": ("carstudio.commands.doctor:Doctor", "what is installed, what is missing, what it is for, how to get it"),
 }

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from carstudio.cli import run
-from carstudio.commands.fit import objective, photographs_of
+from carstudio.commands.fit import photographs_of
+from carstudio.commands.opening import open_car
 from carstudio.dataset.pixels import PatchCache
 from carstudio.dataset.store import PatchStore
 from carstudio.errors import InputError
@@ -15,8 +16,8 @@ from carstudio.fitting.car_file import load_car
 from carstudio.fitting.optimise import FitConfig, FitPixels, Fitted, field_parameters, fit
 from carstudio.models.interface import CategoryModel, Latents
 from carstudio.training.batches import generator_for, patch_batch, pixel_batch
-from carstudio.training.car_opening import open_car
 from carstudio.training.checkpoint import load_model
+from carstudio.training.patch_fitting import objective
 from carstudio.training.trainer import train
 from training.toy import TINY, toy_store
 

@@ -1,27 +1,21 @@
 """`carstudio fit`: a trained model and photographs of one car -> that car, in a file."""
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import torch
 import tyro
 
 from carstudio.commands.command import Outcome, Output, provenance, split_of
-from carstudio.dataset.pixels import PatchCache, PreparedPatch
+from carstudio.dataset.pixels import PatchCache
 from carstudio.dataset.store import PatchStore, open_store
 from carstudio.devices import pick_device
 from carstudio.errors import InputError
 from carstudio.fitting.car_file import Car, save_car
-from carstudio.fitting.optimise import FitConfig, FitPixels, Fitted, fit, known_hits
-from carstudio.models.interface import CategoryModel, Latents
-from carstudio.progress import Report
-from carstudio.rendering.volume import Rendering
-from carstudio.training.batches import generator_for, patch_batch, pixel_batch
+from carstudio.fitting.optimise import FitConfig
+from carstudio.models.interface import Latents
 from carstudio.training.checkpoint import describe_model, load_model
-from carstudio.training.losses import LossConfig, training_loss
-
-_HELD_OUT_RAYS = 512  # per photograph
+from carstudio.training.patch_fitting import fit_patches
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +52,7 @@ class Fit(Output):
         cache = PatchCache(store, model.encoder_side_px)
         patches = [cache[patch_id] for patch_id in patch_ids]
         with self.progress() as report:
-            fitted = self._fit(model, patches, device, report)
+            fitted = fit_patches(model, patches, self.config, rays=self.rays, seed=self.seed, report=report)
         licence = store.record(patch_ids[0]).licence
         size = patches[0].box.size.tolist()
         car = Car(
@@ -83,39 +77,6 @@ class Fit(Output):
             text += f"; loss on held-out pixels {fitted.curve[0][1]:.4f} -> {min(v for _, v in fitted.curve):.4f}"
         values: dict[str, Any] = {"out": str(self.out), "instance_id": car.instance_id, "patches": patch_ids}
         return Outcome(text, values | {"steps": fitted.steps, "held_out_loss": car.provenance["held_out_loss"]})
-
-    def _fit(self, model: CategoryModel, patches: list[PreparedPatch], device: torch.device, report: Report) -> Fitted:
-        with torch.no_grad():
-            each = model.encode(patch_batch(patches).to(device))
-        start = Latents(each.shape.float().mean(0, keepdim=True), each.texture.float().mean(0, keepdim=True))
-
-        def draw(step: int, rays: int = self.rays) -> FitPixels:
-            pixels = pixel_batch(patches, rays, generator_for(self.seed, step, "pixels")).to(device)
-            car = torch.zeros(len(patches), dtype=torch.long, device=device)
-            return FitPixels(pixels.rays, pixels.box, pixels.rgb, pixels.alpha, pixels.is_known, car)
-
-        held_out = draw(self.config.steps, _HELD_OUT_RAYS)  # of a step that is never made
-        return fit(model, start, draw, objective, self.config, held_out=held_out, report=report)
-
-
-def objective(renderings: tuple[Rendering, ...], pixels: FitPixels) -> torch.Tensor:
-    """The training loss of each car by itself, summed: no car's steps depend on its company.
-
-    Colour counts against black, so that the silhouette does too.
-    """
-    counts = known_hits(pixels)
-    losses = []
-    for car in pixels.car.unique().tolist():
-        rows = pixels.car == car
-        own = tuple(select_rows(rendering, rows) for rendering in renderings)
-        terms = training_loss(own, pixels.rgb[rows], pixels.alpha[rows], counts[rows], LossConfig(colour="whole-crop"))
-        losses += list(terms.values())
-    return torch.stack(losses).sum()
-
-
-def select_rows(rendering: Rendering, rows: torch.Tensor) -> Rendering:
-    """Some batch entries of a rendering."""
-    return Rendering(**{part.name: getattr(rendering, part.name)[rows] for part in fields(Rendering)})
 
 
 def photographs_of(store: PatchStore, name: str, split: str | None) -> list[str]:

@@ -15,8 +15,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8, UInt16
 
 from carstudio.errors import InputError
-from carstudio.files import inside, sha256_file
-from carstudio.fitting.car_file import DESCRIPTION
+from carstudio.files import inside
 from carstudio.geometry.camera import Camera
 from carstudio.images import decode_depth, decode_image, read_image_file
 from carstudio.models.interface import CategoryModel, Latents
@@ -31,10 +30,9 @@ from carstudio.scene.layers import FAINTEST, bands, merge_layers, ray_lengths, t
 from carstudio.scene.lidar import background_points, sparse_depth
 from carstudio.scene.matching import GAMMA
 from carstudio.scene.shadow import contact_shadow
+from carstudio.scene.shelf import CarShelf
 from carstudio.scene.truth import ObjectTruth, truth_of
-from carstudio.training.car_opening import open_car
 
-CARS = "cars"
 _OUTLINE_PX = 3  # around a deleted car's box: labels are that inexact, and cameras blur
 _HOLE_REACH_M = 0.5  # of ground around a deleted car: its contact shadow
 _SEEN = 0.25  # opacity above which an object of the photograph is not painted over by a fill behind it
@@ -142,14 +140,14 @@ def _checked(root: str, ref: FileRef, what: str) -> bytes:
 @lru_cache(maxsize=_KEPT_CARS)
 def opened_car(scene_folder: str, ref: CarRef, run: str | None) -> tuple[CategoryModel, Latents]:
     """The car's model and latents, read once per process; `InputError` when it is not the scene's."""
-    folder = inside(Path(scene_folder) / CARS, ref.name)
-    if not (folder / DESCRIPTION).is_file() or sha256_file(folder / DESCRIPTION) != ref.sha256:
-        raise InputError(
-            f"{folder}: not the car that the scene speaks of (its sha256 differs, or it is gone); restore it, or make "
-            "the scene again"
-        )
-    model, car = open_car(folder, None if run is None else Path(run))
-    return model.eval(), car.latents
+    shelf = _shelf(scene_folder, run)
+    car = shelf.load(ref)
+    return shelf.model_of(car).eval(), car.latents
+
+
+@lru_cache(maxsize=2)
+def _shelf(scene_folder: str, run: str | None) -> CarShelf:
+    return CarShelf(Path(scene_folder), () if run is None else (Path(run),))
 
 
 def _points(job: FrameJob, moving: Sequence[PlacedBox]) -> Float[np.ndarray, "n 3"] | None:
