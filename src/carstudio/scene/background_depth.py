@@ -19,6 +19,7 @@ from carstudio.scene.lidar import sparse_depth
 FARTHEST_M = 120.0
 _GROUND_NEAR_M, _GROUND_PER_M = 0.25, 0.01  # what is lower than this above the plane is ground: camber, kerbs, noise
 _SINK_M = 0.2  # the ground lets wheels in this far before it hides them: no plane is that exact
+_UNKNOWN = np.float32(1e6)
 _DIAMOND = np.array([[0, 0, 1, 0, 0], [0, 1, 1, 1, 0], [1, 1, 1, 1, 1], [0, 1, 1, 1, 0], [0, 0, 1, 0, 0]], np.uint8)
 
 
@@ -28,9 +29,9 @@ def densified(sparse: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "h
     nearness = np.asarray(np.where(known, 1 / np.maximum(sparse, 0.1), 0.0), np.float32)
     nearness = np.asarray(cv2.dilate(nearness, _DIAMOND))
     nearness = np.asarray(cv2.morphologyEx(nearness, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)))
-    for side in (7, 15, 25):
-        wider = cv2.dilate(nearness, np.ones((side, side), np.uint8))
-        nearness = np.where(nearness > 0, nearness, wider)
+    for side in (7, 15, 25):  # wider gaps take the farthest of what is around them: a guess must not hide cars
+        wider = cv2.erode(np.where(nearness > 0, nearness, _UNKNOWN), np.ones((side, side), np.uint8))
+        nearness = np.where((nearness > 0) | (wider >= _UNKNOWN), nearness, wider)
     smooth = cv2.medianBlur(nearness, 5)
     nearness = np.where((nearness > 0) & (smooth > 0), smooth, nearness)
     with np.errstate(divide="ignore"):

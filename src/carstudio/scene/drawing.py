@@ -22,7 +22,7 @@ from carstudio.models.interface import CategoryModel, Latents
 from carstudio.perception.monocular_depth import estimate_inverse_depth
 from carstudio.scene.background_depth import align_depth, background_depth, hiding_depth, is_ground
 from carstudio.scene.filling import fill_hole
-from carstudio.scene.footprint import any_of, ground_mask, ground_rectangle, grown, outline_mask
+from carstudio.scene.footprint import any_of, body_mask, ground_mask, ground_rectangle, grown, outline_mask
 from carstudio.scene.frame_jobs import DrawingSettings, FrameJob, PlacedObject, frame_job
 from carstudio.scene.graph import CarRef, FileRef, PlacedBox, Scene, SceneFrame
 from carstudio.scene.ground import Ground, find_ground
@@ -34,7 +34,7 @@ from carstudio.scene.shelf import CarShelf
 from carstudio.scene.truth import ObjectTruth, truth_of
 
 _OUTLINE_PX = 3  # around a deleted car's box: labels are that inexact, and cameras blur
-_HOLE_REACH_M = 0.5  # of ground around a deleted car: its contact shadow
+_HOLE_REACH_M = 0.35  # of ground around a deleted car: its contact shadow
 _SEEN = 0.25  # opacity above which an object of the photograph is not painted over by a fill behind it
 _KEPT_PHOTOS, _KEPT_CARS = 24, 32  # per process
 # Cityscapes' label ids; what is not known is 255, which its tools ignore.
@@ -182,7 +182,7 @@ def _background(
 
 def _hole(job: FrameJob, ground: Ground, camera: Camera) -> Bool[np.ndarray, "height width"]:
     """Pixels of cars that have gone, with their contact shadows."""
-    outlines = (outline_mask(box, camera, grow_px=_OUTLINE_PX) for box in job.gone)
+    outlines = (body_mask(box, camera, grow_px=_OUTLINE_PX) for box in job.gone)
     shadows = (ground_mask(box, ground, camera, reach_m=_HOLE_REACH_M) for box in job.gone)
     return any_of(outlines, camera) | any_of(shadows, camera)
 
@@ -197,7 +197,7 @@ def _protected(job: FrameJob, stack: "_Stack", camera: Camera) -> Bool[np.ndarra
         if placed.is_drawn or placed.box.center[2] >= nearest_gone:
             continue
         alone = stack.alone.get(placed.number)
-        kept |= outline_mask(placed.box, camera) if alone is None else grown(alone > _SEEN, 1)
+        kept |= body_mask(placed.box, camera) if alone is None else grown(alone > _SEEN, 1)
     return kept
 
 

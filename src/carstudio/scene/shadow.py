@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float
 
 from carstudio.geometry.camera import Camera
-from carstudio.scene.footprint import SHADOW_REACH_M, GroundRectangle
-from carstudio.scene.ground import Ground
+from carstudio.scene.footprint import SHADOW_REACH_M, GroundRectangle, flat_mask
+from carstudio.scene.ground import Ground, unproject_pixels
 
 SOFTNESS_M = SHADOW_REACH_M / 3  # standard deviation: a car's sills and bumpers are 0.2 to 0.3 m above the ground
 DARKEST = 0.65  # share of the light that the middle of a car's underside takes; the rest comes in from the sides
@@ -24,12 +24,10 @@ def contact_shadow(
 ) -> Float[np.ndarray, "height width"]:
     """Share of the ground's light that the car takes, for each pixel as if the ground were seen in it; 0 above it."""
     depth = ground.depth(camera)
-    seen = np.isfinite(depth) & (depth > 0) & (depth < 1e3)
     shade = np.zeros(depth.shape)
-    fx, fy, cx, cy = (float(value) for value in camera.intrinsics)
-    rows, columns = np.nonzero(seen)
-    z = depth[rows, columns]
-    points = np.stack([(columns + 0.5 - cx) / fx * z, (rows + 0.5 - cy) / fy * z, z], axis=-1) - rectangle.center
+    near = flat_mask(rectangle.grown(SHADOW_REACH_M), camera)
+    rows, columns = np.nonzero(near & np.isfinite(depth) & (depth > 0))
+    points = unproject_pixels(camera, rows, columns, depth[rows, columns]) - rectangle.center
     along = _blurred_slab(points @ rectangle.along, rectangle.half_m[0])
     across = _blurred_slab(points @ rectangle.across, rectangle.half_m[1])
     shade[rows, columns] = darkest * math.exp(-max(rectangle.gap_m, 0.0) / _FLOATS_M) * along * across
