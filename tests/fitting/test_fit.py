@@ -8,6 +8,7 @@ import torch
 
 from carstudio.cli import run
 from carstudio.commands.fit import car_folders, photographs_of
+from carstudio.commands.opening import open_car
 from carstudio.dataset.pixels import PatchCache
 from carstudio.dataset.store import PatchStore
 from carstudio.errors import InputError
@@ -16,7 +17,6 @@ from carstudio.fitting.car_file import load_car
 from carstudio.fitting.optimise import FitConfig, Fitted, field_parameters
 from carstudio.models.interface import CategoryModel
 from carstudio.training.batches import patch_batch
-from carstudio.training.car_opening import open_car
 from carstudio.training.checkpoint import load_model
 from carstudio.training.patch_fitting import fit_cars
 from carstudio.training.trainer import train

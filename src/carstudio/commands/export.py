@@ -8,12 +8,12 @@ import torch
 import tyro
 
 from carstudio.commands.command import Outcome, Output
+from carstudio.commands.opening import open_car
 from carstudio.errors import InputError
 from carstudio.export.mesh import MeshConfig, fuse, take_views, write_glb
 from carstudio.export.splats import metric_splats, write_ply
 from carstudio.files import require_writable
 from carstudio.models.car_gaussians import CarGaussians
-from carstudio.training.car_opening import open_car
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,6 +8,7 @@ import torch
 import tyro
 
 from carstudio.commands.command import Outcome, Output
+from carstudio.commands.opening import open_car
 from carstudio.dataset.store import PatchStore, open_store
 from carstudio.devices import pick_device
 from carstudio.errors import InputError
@@ -18,7 +19,6 @@ from carstudio.images import write_png
 from carstudio.models.interface import Latents
 from carstudio.report.panels import Turntable, encode_patch, turntable
 from carstudio.report.video import write_gif, write_mp4
-from carstudio.training.car_opening import open_car
 from carstudio.training.checkpoint import load_model
 
 

@@ -15,12 +15,34 @@ from carstudio.scene.ground import Ground, bottom_center
 
 _FINE = 4  # bits below the pixel of OpenCV's fixed-point positions
 _FAR_PX = 1e6  # OpenCV's fixed-point positions are 32 bit; nothing that far matters
+CAR_HEIGHT_M = 1.85  # higher boxes are vans and trucks
+# Corners (canonical: x front, y down, z left) of what a passenger car fills: up to the sills of its windows all of the
+# box; above them not the bonnet, and less at the sides. Estates and hatchbacks fill the box up to the roof's rear end.
+BODY = ((-1.0, -0.2, -1.0), (1.0, 1.0, 1.0))
+ROOF = ((-0.95, -1.0, -0.85), (0.5, -0.2, 0.85))
 SHADOW_REACH_M = 0.6  # beside the box: where a contact shadow ends (three of its softest standard deviations)
 
 
 def outline_mask(placed: PlacedBox, camera: Camera, *, grow_px: int = 0) -> Bool[np.ndarray, "height width"]:
     """Pixels that the convex outline of the projected box touches, and `grow_px` around it."""
-    return _fill(_single(placed), camera, grow_px)
+    return _fill((_single(placed),), camera, grow_px)
+
+
+def body_mask(placed: PlacedBox, camera: Camera, *, grow_px: int = 0) -> Bool[np.ndarray, "height width"]:
+    """Pixels that a vehicle which fills this box may cover: of a passenger car less than the box at its roof.
+
+    The outline of two boxes, the body and a roof drawn in from the bonnet and the sides; of anything higher than
+    a passenger car the whole box.
+    """
+    if placed.size[1] > CAR_HEIGHT_M:
+        return outline_mask(placed, camera, grow_px=grow_px)
+    box = placed.box()
+    parts = []
+    for low, high in BODY, ROOF:
+        middle, share = (torch.tensor(low) + torch.tensor(high)) / 2, (torch.tensor(high) - torch.tensor(low)) / 2
+        center = box.center[0] + box.rotation[0] @ (middle * box.size[0] / 2)
+        parts.append(Box3D(center, box.size[0] * share, box.rotation[0]))
+    return _fill(tuple(parts), camera, grow_px)
 
 
 def _single(placed: PlacedBox) -> Box3D:
@@ -28,9 +50,9 @@ def _single(placed: PlacedBox) -> Box3D:
     return Box3D(box.center[0], box.size[0], box.rotation[0])
 
 
-def _fill(box: Box3D, camera: Camera, grow_px: int) -> Bool[np.ndarray, "height width"]:
+def _fill(boxes: tuple[Box3D, ...], camera: Camera, grow_px: int) -> Bool[np.ndarray, "height width"]:
     mask = np.zeros((camera.height, camera.width), np.uint8)
-    points = projected_hull_points(box, camera).double().numpy()
+    points = np.concatenate([projected_hull_points(box, camera).double().numpy() for box in boxes])
     if len(points) == 0:
         return mask.astype(bool)
     fixed = np.round((points - 0.5).clip(-_FAR_PX, _FAR_PX) * 2**_FINE).astype(np.int32)
@@ -48,7 +70,7 @@ def ground_mask(
     placed: PlacedBox, ground: Ground, camera: Camera, *, reach_m: float = SHADOW_REACH_M
 ) -> Bool[np.ndarray, "height width"]:
     """Pixels of the ground under the box and up to `reach_m` beside it."""
-    return _fill(ground_rectangle(placed, ground).grown(reach_m).flat_box(), camera, 0)
+    return flat_mask(ground_rectangle(placed, ground).grown(reach_m), camera)
 
 
 @dataclass(frozen=True)
@@ -85,6 +107,11 @@ def ground_rectangle(placed: PlacedBox, ground: Ground) -> GroundRectangle:
     along = along / norm if norm > 1e-6 else np.array([0.0, -normal[2], normal[1]]) / np.hypot(normal[1], normal[2])
     half = (placed.size[0] / 2, placed.size[2] / 2)
     return GroundRectangle(bottom + gap * normal, along, np.cross(along, normal), normal, half, gap)
+
+
+def flat_mask(rectangle: GroundRectangle, camera: Camera) -> Bool[np.ndarray, "height width"]:
+    """Pixels of a rectangle on the ground, and one pixel around them."""
+    return _fill((rectangle.flat_box(),), camera, 1)
 
 
 def any_of(masks: Iterable[Bool[np.ndarray, "height width"]], camera: Camera) -> Bool[np.ndarray, "height width"]:

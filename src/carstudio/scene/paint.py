@@ -38,7 +38,7 @@ def parse_colour(colour: str | tuple[float, float, float]) -> tuple[float, float
             red, green, blue = ImageColor.getrgb(colour)[:3]
         except ValueError as error:
             raise InputError(f"colour {colour!r}: expected '#rrggbb', a name such as red, or three numbers") from error
-        return red / 255, green / 255, blue / 255
+        return red / 255.0, green / 255.0, blue / 255.0
     most = 255.0 if max(colour) > 1 else 1.0
     if min(colour) < 0 or max(colour) > most:
         raise InputError(f"colour {colour}: expected three numbers of 0 to 1, or of 0 to 255")

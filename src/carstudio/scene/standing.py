@@ -10,9 +10,9 @@ import numpy as np
 from carstudio.errors import InputError
 from carstudio.scene.edits import AxesName, Place
 from carstudio.scene.graph import PlacedBox, Scene, SceneFrame, Vector3
-from carstudio.scene.terrain import CAMERA_HEIGHT_M, Terrain, terrain_of
 from carstudio.scene.path import EgoPath, ego_path
 from carstudio.scene.places import Pose, box_standing, heading, pose_of, turn_y, world_from_camera
+from carstudio.scene.terrain import CAMERA_HEIGHT_M, Terrain, terrain_of
 
 
 @dataclass(frozen=True)
@@ -123,8 +123,8 @@ def _in_camera(spot: _Spot, axes: AxesName, frame: SceneFrame, around: Surroundi
     else:
         height = _world_height(pose) if spot.y is None else spot.y
         point = np.array([spot.x, height, spot.z])
-        yaw = spot.yaw_rad
-        if yaw is None:
+        yaw = spot.yaw_rad or 0.0
+        if spot.yaw_rad is None:
             yaw = around.path.to_path(point)[1] if around.path is not None else 0.0
         turn = turn_y(yaw)
     return pose[:3, :3].T @ turn, pose[:3, :3].T @ (point - pose[:3, 3])
