@@ -35,10 +35,10 @@ def parse_colour(colour: str | tuple[float, float, float]) -> tuple[float, float
     """`#c01020`, `red`, or three numbers (0 to 1, or 0 to 255 where one is above 1) as sRGB in [0, 1]."""
     if isinstance(colour, str):
         try:
-            red, green, blue = ImageColor.getrgb(colour)[:3]
+            levels = ImageColor.getrgb(colour)
         except ValueError as error:
             raise InputError(f"colour {colour!r}: expected '#rrggbb', a name such as red, or three numbers") from error
-        return red / 255.0, green / 255.0, blue / 255.0
+        return levels[0] / 255, levels[1] / 255, levels[2] / 255
     most = 255.0 if max(colour) > 1 else 1.0
     if min(colour) < 0 or max(colour) > most:
         raise InputError(f"colour {colour}: expected three numbers of 0 to 1, or of 0 to 255")
