@@ -1,18 +1,20 @@
 """`carstudio edit`: a scene and an edit file -> edited frames with depth, instance masks and labels."""
 
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 
-from carstudio.commands.command import Outcome, Output, plain
+from carstudio.commands.command import Outcome, Output, plain, provenance
 from carstudio.errors import InputError
 from carstudio.files import make_folder
 from carstudio.locks import FolderLock
 from carstudio.scene.edit_file import read_edit_file, write_edits
 from carstudio.scene.editing import Edited, apply_edits
+from carstudio.scene.frame_jobs import PRESETS
 from carstudio.scene.graph import Scene
 from carstudio.scene.random_edits import Traffic, random_traffic
 from carstudio.scene.scene_file import load_scene, save_scene
@@ -43,6 +45,8 @@ class Edit(Output):
     """The run that cars were made with, where it is not a bundled model."""
     root: Path | None = None
     """Where the log lies now, when it has been moved since the scene was made."""
+    preset: Literal["fast", "fine"] = "fast"
+    """fast: one ray per pixel; fine: four, which is smoother at contours."""
     dry_run: bool = False
     """Write only the edited scene and tell what looks wrong; draw nothing."""
     workers: int = 0
@@ -56,6 +60,9 @@ class Edit(Output):
         """Edit, then draw."""
         if (self.edits is None) == (self.random is None):
             raise InputError("expected either an edit file or --random N; see docs/edit_a_log.md")
+        if self.workers < 0:
+            raise InputError(f"--workers must be 0 (one per core) or more, found {self.workers}")
+        settings = replace(PRESETS[self.preset], model=None if self.model is None else str(self.model))
         scene = load_scene(self.scene, root=self.root)
         make_folder(self.out)
         with FolderLock(self.out / SCENE):
@@ -69,7 +76,14 @@ class Edit(Output):
         write_edited = import_module("carstudio.scene.writing").write_edited
         with self.progress() as report:
             summary = write_edited(
-                original, edited.scene, self.out / SCENE, self.out, workers=self.workers, report=report
+                original,
+                edited.scene,
+                self.out / SCENE,
+                self.out,
+                workers=self.workers or os.cpu_count() or 1,
+                report=report,
+                settings=settings,
+                provenance=provenance(),
             )
         text = f"{self.out}: {len(scene.frames)} frames; look at {self.out / 'index.html'}"
         return Outcome("\n".join([text, *told]), {**value, "summary": plain(summary)})
