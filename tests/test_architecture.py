@@ -40,6 +40,7 @@ MAY_IMPORT = {
     "export": FIELD | DATA | BASE | {"fitting", "training", "evaluation", "scene", "lift", "report"},
     "viewer": FIELD | DATA | BASE | {"fitting", "training", "evaluation", "scene", "lift", "report", "export"},
     "recipes": FIELD | {"errors", "training"},
+    "comparison": FIELD | DATA | BASE | {"fitting", "training", "evaluation", "report", "recipes"},
 }
 DOORS = {"cli", "commands", "demo"}  # may import everything; nobody imports them
 PICKLERS = {"pickle", "dill", "cloudpickle", "shelve", "joblib"}

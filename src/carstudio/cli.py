@@ -34,6 +34,7 @@ VERBS = {
     ),
     "train": ("carstudio.commands.train:Train", "recipe + CarPatch3D -> trained model"),
     "evaluate": ("carstudio.commands.evaluate:Evaluate", "trained model + protocol -> result rows and their table"),
+    "table": ("carstudio.commands.table:MakeTable", "the paper's tables -> every row trained and scored alike"),
     "report": ("carstudio.commands.report:WriteReport", "trained model + store -> both protocols, pictures, one page"),
     "fit": ("carstudio.commands.fit:Fit", "trained model + photos of one car -> that car, in a file"),
     "export": ("carstudio.commands.export:Export", "car -> GLB or splat PLY"),

@@ -4,9 +4,12 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from carstudio.errors import InputError
+from carstudio.models.autorf import AutoRFConfig
 from carstudio.models.car_gaussians import CarGaussiansConfig
 from carstudio.models.car_nerf import CarNeRFConfig
+from carstudio.models.code_nerf import CodeNeRFConfig
 from carstudio.models.encoders import EncoderConfig
+from carstudio.models.pixel_nerf import PixelNeRFConfig
 from carstudio.rendering.field import SamplingConfig
 from carstudio.rendering.gaussians.tracing import SplattingConfig
 from carstudio.training.losses import LossConfig
@@ -82,6 +85,58 @@ def car_gaussians_preview() -> TrainConfig:
     return replace(config, recipe="car-gaussians-preview", model=model, steps=2_000)
 
 
+def pixelnerf_resnet() -> TrainConfig:
+    """PixelNeRF in the box frame: features of the pixel that shows a sample, five residual blocks of 512, rate 1e-4."""
+    return replace(
+        car_nerf_no_mask(),
+        recipe="pixelnerf-resnet",
+        model=PixelNeRFConfig(),
+        schedule=ScheduleConfig(first=1e-4, last=1e-4),
+    )
+
+
+def pixelnerf_resnet_global() -> TrainConfig:
+    """The same with one feature vector per car, as Car-Studio's released code had it."""
+    return replace(pixelnerf_resnet(), recipe="pixelnerf-resnet-global", model=PixelNeRFConfig(features="global"))
+
+
+def pixelnerf_mlp() -> TrainConfig:
+    """PixelNeRF's features joined to the input of NeRF's MLP, 8 x 256, 10 and 4 octaves."""
+    model = PixelNeRFConfig(
+        backbone="mlp",
+        width=256,
+        depth=8,
+        position_frequencies=10,
+        frequency_factor=1.0,
+        direction_frequencies=4,
+        density="softplus",
+    )
+    return replace(car_nerf_no_mask(), recipe="pixelnerf-mlp", model=model)
+
+
+def autorf() -> TrainConfig:
+    """AutoRF: points instead of cones, 8 x 128, 64 samples in one pass, colour over the whole crop."""
+    return replace(car_nerf_no_mask(), recipe="autorf", model=AutoRFConfig())
+
+
+def autorf_occupancy() -> TrainConfig:
+    """AutoRF with the losses of its own paper: colour on the car, and the likelihood of the mask."""
+    return replace(autorf(), recipe="autorf-occupancy", loss=LossConfig(mask_error="log"))
+
+
+def code_nerf() -> TrainConfig:
+    """CodeNeRF: a code per car learned with the field, AdamW at 1e-4 for the field and 1e-3 for codes, 96 samples."""
+    return replace(
+        car_nerf_no_mask(),
+        recipe="code-nerf",
+        model=CodeNeRFConfig(),
+        loss=LossConfig(colour="whole-crop", mask_weight=0.0, code_weight=1e-4),
+        schedule=ScheduleConfig(first=1e-4, last=1e-4),
+        optimizer="adamw",
+        code_rate=10.0,
+    )
+
+
 RECIPES: dict[str, Callable[[], TrainConfig]] = {
     "car-nerf": car_nerf,
     "car-nerf-no-mask": car_nerf_no_mask,
@@ -89,6 +144,12 @@ RECIPES: dict[str, Callable[[], TrainConfig]] = {
     "car-nerf-small": car_nerf_small,
     "car-gaussians": car_gaussians,
     "car-gaussians-preview": car_gaussians_preview,
+    "pixelnerf-resnet": pixelnerf_resnet,
+    "pixelnerf-resnet-global": pixelnerf_resnet_global,
+    "pixelnerf-mlp": pixelnerf_mlp,
+    "autorf": autorf,
+    "autorf-occupancy": autorf_occupancy,
+    "code-nerf": code_nerf,
 }
 
 

@@ -7,17 +7,18 @@ import pytest
 import torch
 
 from carstudio.cli import run
-from carstudio.commands.fit import photographs_of
+from carstudio.commands.fit import car_folders, photographs_of
 from carstudio.commands.opening import open_car
 from carstudio.dataset.pixels import PatchCache
 from carstudio.dataset.store import PatchStore
 from carstudio.errors import InputError
+from carstudio.fitting.boxes import BoxFreedom
 from carstudio.fitting.car_file import load_car
-from carstudio.fitting.optimise import FitConfig, FitPixels, Fitted, field_parameters, fit
-from carstudio.models.interface import CategoryModel, Latents
-from carstudio.training.batches import generator_for, patch_batch, pixel_batch
+from carstudio.fitting.optimise import FitConfig, Fitted, field_parameters
+from carstudio.models.interface import CategoryModel
+from carstudio.training.batches import patch_batch
 from carstudio.training.checkpoint import load_model
-from carstudio.training.patch_fitting import objective
+from carstudio.training.patch_fitting import fit_cars
 from carstudio.training.trainer import train
 from training.toy import TINY, toy_store
 
@@ -38,35 +39,18 @@ def cars(store: PatchStore) -> list[str]:
     return sorted(set(store.table(["instance_id"])["instance_id"].to_pylist()))
 
 
-def fit_cars(
+def fit_named(
     model: CategoryModel, store: PatchStore, names: list[str], config: FitConfig, looks: bool = False
 ) -> Fitted:
-    """Cars in one batch, each with the pixels that it would be shown alone."""
     cache = PatchCache(store, model.encoder_side_px)
     groups = [[cache[patch_id] for patch_id in photographs_of(store, name, None)] for name in names]
-    with torch.no_grad():
-        each = [model.encode(patch_batch(group)) for group in groups]
-    start = Latents(*(torch.stack([getattr(one, kind).mean(0) for one in each]) for kind in ("shape", "texture")))
-
-    def draw(step: int) -> FitPixels:
-        parts = [pixel_batch(group, 48, generator_for(0, step, "pixels")) for group in groups]
-        rays = type(parts[0].rays)(
-            *(torch.cat([getattr(p.rays, k) for p in parts]) for k in ("origins", "directions", "radii"))
-        )
-        box = type(parts[0].box)(
-            *(torch.cat([getattr(p.box, k) for p in parts]) for k in ("center", "size", "rotation"))
-        )
-        joined = (torch.cat([getattr(p, k) for p in parts]) for k in ("rgb", "alpha", "is_known"))
-        owner = torch.cat([torch.full((len(group),), i) for i, group in enumerate(groups)])
-        return FitPixels(rays, box, *joined, owner)
-
-    return fit(model, start, draw, objective, config, held_out=draw(10**6) if looks else None)
+    return fit_cars(model, groups, config, rays=48, stops_early=looks)
 
 
 def test_zero_steps_keep_the_encoders_latents(store: PatchStore, trained: Path) -> None:
     model = load_model(trained)
     name = cars(store)[0]
-    found = fit_cars(model, store, [name], FitConfig(steps=0))
+    found = fit_named(model, store, [name], FitConfig(steps=0))
     cache = PatchCache(store, model.encoder_side_px)
     with torch.no_grad():
         each = model.encode(patch_batch([cache[patch_id] for patch_id in photographs_of(store, name, None)]))
@@ -77,7 +61,7 @@ def test_zero_steps_keep_the_encoders_latents(store: PatchStore, trained: Path) 
 def test_latents_get_better_and_the_model_stays_to_the_bit(store: PatchStore, trained: Path) -> None:
     model = load_model(trained)
     before = {name: value.clone() for name, value in model.state_dict().items()}
-    found = fit_cars(model, store, [cars(store)[1]], FitConfig(steps=30, latent_rate=0.05), looks=True)
+    found = fit_named(model, store, [cars(store)[1]], FitConfig(steps=30, latent_rate=0.05), looks=True)
     assert found.weights == {}
     assert min(value for _, value in found.curve) < 0.985 * found.curve[0][1]
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
@@ -88,8 +72,8 @@ def test_the_field_is_fitted_in_a_copy_and_does_more(store: PatchStore, trained:
     model = load_model(trained)
     before = {name: value.clone() for name, value in model.state_dict().items()}
     name = cars(store)[1]
-    latents = fit_cars(model, store, [name], FitConfig(steps=30), looks=True)
-    both = fit_cars(model, store, [name], FitConfig(steps=30, field_rate=5e-3), looks=True)
+    latents = fit_named(model, store, [name], FitConfig(steps=30), looks=True)
+    both = fit_named(model, store, [name], FitConfig(steps=30, field_rate=5e-3), looks=True)
     assert min(v for _, v in both.curve) < min(v for _, v in latents.curve)
     assert all(torch.equal(value, before[key]) for key, value in model.state_dict().items())
     assert both.weights.keys() == {key for key, _ in field_parameters(model)}
@@ -99,17 +83,64 @@ def test_the_field_is_fitted_in_a_copy_and_does_more(store: PatchStore, trained:
 def test_a_car_in_a_batch_is_fitted_as_alone(store: PatchStore, trained: Path) -> None:
     model, config = load_model(trained), FitConfig(steps=8)
     names = cars(store)[:3]
-    together = fit_cars(model, store, names, config)
+    together = fit_named(model, store, names, config)
     for index, name in enumerate(names):
-        alone = fit_cars(model, store, [name], config)
+        alone = fit_named(model, store, [name], config)
         torch.testing.assert_close(together.latents.shape[index], alone.latents.shape[0], rtol=1e-4, atol=1e-5)
         torch.testing.assert_close(together.latents.texture[index], alone.latents.texture[0], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("refines", [False, True], ids=["boxes stay", "boxes move"])
+def test_company_changes_no_car_not_even_when_it_stops(store: PatchStore, trained: Path, refines: bool) -> None:
+    """Cars pass their best at different steps; each keeps its own, as if it had been alone."""
+    model = load_model(trained)
+    cache = PatchCache(store, model.encoder_side_px)
+    groups = [[cache[patch_id] for patch_id in photographs_of(store, name, None)] for name in cars(store)[:3]]
+    freedom = BoxFreedom(refine_pose=refines, refine_size=refines, box_rate=0.1)
+    config = FitConfig(steps=24, latent_rate=0.1, patience=1, look_every=3, box=freedom)
+    together = fit_cars(model, groups, config, rays=32)
+    ends, row, moved = set(), 0, 0.0
+    for index, group in enumerate(groups):
+        alone = fit_cars(model, [group], config, rays=32)
+        ends.add(alone.steps)
+        best = min(range(len(alone.curve)), key=lambda i: alone.curve[i][1])
+        for place in range(best + 1):
+            assert together.curves[index][place] == pytest.approx(alone.curve[place], rel=1e-3)
+        torch.testing.assert_close(together.latents.shape[index], alone.latents.shape[0], rtol=1e-3, atol=1e-4)
+        if refines:
+            assert together.box is not None
+            assert alone.box is not None
+            moved += float((alone.box.center - torch.stack([p.box.center for p in group])).norm())
+            torch.testing.assert_close(together.box.center[row], alone.box.center[0], rtol=1e-3, atol=1e-4)
+        row += len(group)
+    assert len(ends) > 1, "cars that all stop together would show nothing"
+    assert (moved > 0.01) is refines
+
+
+def test_the_verb_fits_all_cars_and_keeps_those_that_are_there(
+    store: PatchStore, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["fit", str(trained), "--data", str(store.path), "--out", str(tmp_path / "cars"), "--device", "cpu"]
+    command += ["--steps", "3", "--cars-per-batch", "2", "--refine-pose", "--json"]
+    assert run([*command, "--instance", "all"]) == 0
+    said = json.loads(capsys.readouterr().out)["cars"]
+    assert [told["instance_id"] for told in said] == cars(store)
+    written = [Path(told["out"]) / "car.json" for told in said]
+    first = load_car(written[0].parent)
+    assert len(first.provenance["boxes"]) == len(first.provenance["patches"])
+    (written[1].parent / "car.safetensors").write_bytes(b"damaged")
+    stamps = [path.stat().st_mtime_ns for path in written]
+    assert run([*command, "--instance", *cars(store)]) == 0
+    now = [path.stat().st_mtime_ns for path in written]
+    assert [a == b for a, b in zip(stamps, now, strict=True)] == [True, False, True]
+    load_car(written[1].parent)
+    assert car_folders(Path("o"), ["a/b", "a:b", "../x"]) == [Path("o/a_b-0"), Path("o/a_b-1"), Path("o/x")]
 
 
 def test_fitting_stops_when_held_out_pixels_get_no_better(store: PatchStore, trained: Path) -> None:
     model = load_model(trained)
     config = FitConfig(steps=500, latent_rate=2.0, patience=2, look_every=1)
-    found = fit_cars(model, store, [cars(store)[0]], config, looks=True)
+    found = fit_named(model, store, [cars(store)[0]], config, looks=True)
     assert found.steps < 500
     values = [value for _, value in found.curve]
     assert min(values) <= values[0]

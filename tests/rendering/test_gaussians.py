@@ -87,6 +87,22 @@ def test_the_fast_path_has_the_gradients_of_its_values() -> None:
     assert torch.autograd.gradcheck(found, leaves(cloud)[:4], atol=1e-6)
 
 
+@pytest.mark.parametrize("config", [SplattingConfig(), REFERENCE], ids=["fast", "plain"])
+def test_a_box_has_the_gradients_of_its_values(config: SplattingConfig) -> None:
+    """Pose and size are found by them: colours, opacity and depth against central differences."""
+    cloud, view, box = random_cloud(6, seed=4), camera(5), car_box()
+    rays = image_rays(view)
+
+    def render(center: Tensor, size: Tensor, rotation: Tensor) -> tuple[Tensor, ...]:
+        canonical = to_canonical(rays, Box3D(center, size, rotation))
+        found = render_cloud(cloud, rays, canonical, config)
+        return found.rgb, found.opacity, found.distance_m * found.opacity
+
+    given = [part.clone().requires_grad_() for part in (box.center, box.size, box.rotation)]
+    assert float(render(*given)[1].detach().max()) > 0.1
+    assert torch.autograd.gradcheck(render, given, atol=1e-5, eps=1e-6)
+
+
 @pytest.mark.parametrize("make", [random_cloud, surface_cloud])
 @pytest.mark.parametrize("chunk", [2**9, 2**17])
 def test_the_fast_path_equals_the_plain_one(make, chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:

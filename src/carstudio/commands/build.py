@@ -42,8 +42,8 @@ class Build(Output):
     """Who finds masks: grabcut (no weights), sam[:NAME_OR_DIR], sam2[:NAME_OR_DIR], onnx:FILE (semantic segmentation),
     precomputed:FOLDER (PNG), precomputed:FILE.json (COCO)."""
     box3d: str | None = None
-    """Who finds 3-D boxes: labels, precomputed:FOLDER (KITTI text), precomputed:FILE.json (DD3D), none. Absent: the
-    labels of KITTI, none for photos."""
+    """Who finds 3-D boxes: labels, dd3d:FOLDER (made by `models convert dd3d`), precomputed:FOLDER (KITTI text),
+    precomputed:FILE.json (DD3D's), none. Absent: the labels of KITTI, none for photos."""
     camera: str | None = None
     """photos: exif (the default), paper, FOCAL_PX, FX,FY,CX,CY or calib:PATH (KITTI calibration)."""
     licence: str | None = None

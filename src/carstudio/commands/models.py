@@ -1,4 +1,4 @@
-"""`carstudio models list|download`: the pretrained networks, where they are, and how to carry them offline."""
+"""`carstudio models list|download|convert`: pretrained networks, where they are, how to bring them here."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,19 +17,21 @@ from carstudio.perception.weights import ENCODER_OPTION, KNOWN_MODELS, full_name
 
 @dataclass(frozen=True, kw_only=True)
 class Models(Output):
-    """Show which pretrained networks are on this machine, or download some for machines that are offline later."""
+    """Show which pretrained networks are on this machine, download some of the hub, or convert a public checkpoint."""
 
-    action: tyro.conf.Positional[Literal["list", "download"]]
+    action: tyro.conf.Positional[Literal["list", "download", "convert"]]
     """list: the networks we know, and whether they are here; with folders: loads each and says how to use it.
-    download: fetch networks of the hub."""
+    download: fetch networks of the hub. convert: make a public checkpoint (dd3d CHECKPOINT.pth) a folder of ours."""
     names: tyro.conf.Positional[tuple[str, ...]] = ()
-    """download: names as on the hub (facebook/sam-vit-huge), or without the owner where we know them. list: folders."""
+    """download: names as on the hub (facebook/sam-vit-huge), or without the owner where we know them. list: folders.
+    convert: what it is, and the file: dd3d CHECKPOINT.pth."""
     out: Path | None = None
-    """download: a folder to carry elsewhere (with several names one folder below it for each), not the hub's cache."""
+    """download: a folder to carry elsewhere (with several names one folder below it for each), not the hub's cache.
+    convert: the folder to write."""
 
     def saved(self) -> str:
         """Whole files are kept, and the part of the one that was on its way."""
-        return "what was downloaded is kept"
+        return "what was downloaded is kept" if self.action == "download" else "nothing is changed"
 
     def run(self) -> Outcome:
         """Do what `action` says."""
@@ -37,6 +39,8 @@ class Models(Output):
             if self.out is not None:
                 raise InputError("--out is for download, not for list")
             return check_folders(self.names) if self.names else list_models()
+        if self.action == "convert":
+            return convert_checkpoint(self.names, self.out)
         if not self.names:
             raise InputError("download needs a name, such as sam-vit-huge; `carstudio models list` shows them")
         names = [full_name(name) for name in self.names]
@@ -54,6 +58,23 @@ def _describe(item: Downloaded, out: Path | None) -> str:
     option = option_for(item.name, item.name if out is None else str(item.folder))
     use = f"; use it with {option}" if option else ""
     return f"{item.name}: {item.num_bytes / 1e6:.1f} MB in {item.folder}{use}"
+
+
+def convert_checkpoint(names: tuple[str, ...], out: Path | None) -> Outcome:
+    """`convert dd3d CHECKPOINT.pth --out FOLDER`."""
+    from carstudio.perception.dd3d.weights import MODEL_TYPE, convert
+
+    if len(names) != 2 or names[0] != MODEL_TYPE or out is None:
+        raise InputError(
+            f"convert: expected {MODEL_TYPE} CHECKPOINT.pth --out FOLDER, found {' '.join(names) or 'nothing'}"
+            f"{'' if out else ' without --out'}"
+        )
+    made = convert(Path(names[1]).expanduser(), out)
+    text = (
+        f"{made.folder}: DD3D with {made.backbone}, {made.num_weights / 1e6:.1f} M numbers, "
+        f"{made.num_bytes / 1e6:.0f} MB; use it with --box3d {MODEL_TYPE}:{made.folder}"
+    )
+    return Outcome(text, {"converted": plain(made)})
 
 
 def known_models() -> list[dict[str, Any]]:
@@ -81,6 +102,7 @@ def check_folders(folders: tuple[str, ...]) -> Outcome:
 
 def option_of_folder(folder: Path) -> str:
     """The option that a folder with a network is for; `InputError` when the network cannot be loaded."""
+    from carstudio.dataset.known_boxes import make_box_estimator
     from carstudio.models.encoders import ResNet34Encoder  # these take seconds to import: only where they are needed
     from carstudio.perception.specs import make_detector, make_segmenter
 
@@ -91,6 +113,9 @@ def option_of_folder(folder: Path) -> str:
     if kind == "resnet":
         ResNet34Encoder().load_pretrained(str(folder))
         return ENCODER_OPTION.format(folder)
+    if kind == "dd3d":
+        make_box_estimator(f"dd3d:{folder}")
+        return f"--box3d dd3d:{folder}"
     if kind in ("sam", "sam2", "sam2_video"):
         spec = f"{kind.removesuffix('_video')}:{folder}"
         make_segmenter(spec)

@@ -25,7 +25,8 @@ class Train(Output):
 
     recipe: tyro.conf.Positional[str]
     """car-gaussians (fast), car-gaussians-preview (fastest), car-nerf (the paper's), car-nerf-no-mask,
-    car-nerf-as-released or car-nerf-small."""
+    car-nerf-as-released or car-nerf-small; baselines at their papers' sizes: pixelnerf-resnet, pixelnerf-resnet-global,
+    pixelnerf-mlp, autorf, autorf-occupancy, code-nerf."""
     data: Path
     """The CarPatch3D store."""
     out: Path

@@ -1,4 +1,4 @@
-"""3-D boxes that others found, read from their files: KITTI label or result text, DD3D's JSON.
+"""3-D boxes: those that others found, read from their files (KITTI text, DD3D's JSON), and who finds them here.
 
 A photograph without an entry simply has no boxes; its patches stay, with that as their verdict.
 """
@@ -15,15 +15,14 @@ from carstudio.dataset.sources.cameras import beside
 from carstudio.dataset.sources.kitti_format import DONT_CARE, center_in_camera, parse_labels, read_text
 from carstudio.errors import InputError
 from carstudio.files import read_json
-from carstudio.geometry.transforms import quaternion_from_rotation, rotation_from_quaternion, yaw_from_rotation
+from carstudio.geometry.transforms import rotation_from_quaternion
+from carstudio.perception.dd3d.adapter import DD3D_FROM_CAR, Dd3dEstimator, upright
+from carstudio.perception.dd3d.weights import load_dd3d
 from carstudio.perception.results import BoxEstimator, Detection3D, Photo
 from carstudio.perception.specs import parse_spec
 from carstudio.perception.vehicle_classes import vehicle_type
 
-BOX3D_SPECS = ("labels", "none", "precomputed:FOLDER", "precomputed:FILE.json")
-UPRIGHT = 1e-4  # rad: a box that leans less is described by its yaw
-# Columns: our car's axes (front, down, left) in DD3D's (x front, y left, z up).
-DD3D_FROM_CAR = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
+BOX3D_SPECS = ("labels", "none", "dd3d:FOLDER", "precomputed:FOLDER", "precomputed:FILE.json")
 
 
 @dataclass(frozen=True)
@@ -128,16 +127,6 @@ def _are_numbers(value: Any, count: int) -> bool:
     )
 
 
-def upright(rotation: torch.Tensor) -> tuple[float, tuple[float, float, float, float] | None]:
-    """KITTI's yaw of `camera_from_car`, and its quaternion where the box leans."""
-    yaw = float(yaw_from_rotation(rotation))
-    leaning = math.acos(max(-1.0, min(1.0, float(rotation[1, 1]))))
-    if leaning < UPRIGHT:
-        return yaw, None
-    w, x, y, z = quaternion_from_rotation(rotation).tolist()
-    return yaw, (w, x, y, z)
-
-
 def make_box_estimator(spec: str) -> BoxEstimator | None:
     """Who finds the 3-D boxes; None for `none` (patches stay without one)."""
     kind, argument = parse_spec(spec)
@@ -151,4 +140,8 @@ def make_box_estimator(spec: str) -> BoxEstimator | None:
             read_dd3d(str(path))
             return Dd3dBoxes(path)
         raise InputError(f"--box3d {spec}: no folder of KITTI text (FRAME.txt) and no JSON file of DD3D's there")
+    if kind == "dd3d" and argument is not None:
+        folder = Path(argument).expanduser()
+        load_dd3d(folder)
+        return Dd3dEstimator(folder=folder)
     raise InputError(f"--box3d {spec!r}: expected one of {', '.join(BOX3D_SPECS)}")

@@ -59,8 +59,8 @@ class BuildConfig:
     """Who finds the 2-D boxes: labels (KITTI's default), transformers[:NAME_OR_DIR] (the default of photographs
     without labels), onnx:FILE (YOLOX) or precomputed:FILE.json (COCO)."""
     box3d: str | None = None
-    """Who finds the 3-D boxes: labels (KITTI's default), precomputed:FOLDER (KITTI text), precomputed:FILE.json (DD3D)
-    or none (the default of photographs without labels)."""
+    """Who finds the 3-D boxes: labels (KITTI's default), dd3d:FOLDER (a converted checkpoint), precomputed:FOLDER
+    (KITTI text), precomputed:FILE.json (DD3D's) or none (the default of photographs without labels)."""
     camera: str | None = None
     """exif, paper, FOCAL_PX, FX,FY,CX,CY or calib:PATH; absent: KITTI's own calibration, exif of photos,
     paper for dvm-cars."""
@@ -248,8 +248,8 @@ def input_places(config: BuildConfig) -> list[str | Path]:
 
 def uses_accelerator(config: BuildConfig) -> bool:
     """Whether networks run on a GPU, which several processes would only crowd."""
-    kinds = {spec.partition(":")[0] for spec in (config.detector, config.segmenter) if spec}
-    is_networks = bool(kinds & {"transformers", "sam", "sam2"}) or (
+    kinds = {spec.partition(":")[0] for spec in (config.detector, config.segmenter, config.box3d) if spec}
+    is_networks = bool(kinds & {"transformers", "sam", "sam2", "dd3d"}) or (
         config.detector is None and config.source in UNLABELLED
     )
     return is_networks and pick_device("auto").type != "cpu"

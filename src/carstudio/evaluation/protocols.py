@@ -4,6 +4,7 @@
 another view of the same car. Scores are per image, on the box crop at its own resolution.
 """
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
@@ -45,6 +46,8 @@ class EvaluationConfig:
     """Score at most this many images, evenly spread over the store's order; None: all."""
     seed: int = 0
     """Chooses the input view of each scored view (novel-view)."""
+    least_train_views: int = 0
+    """Leave out cars with fewer photos in the split's training part."""
 
 
 def view_pairs(store: PatchStore, config: EvaluationConfig) -> list[ViewPair]:
@@ -56,6 +59,9 @@ def view_pairs(store: PatchStore, config: EvaluationConfig) -> list[ViewPair]:
     scored = store.patch_ids(kept=True, split=config.split, part=config.part if config.split else "all")
     table = store.table(["patch_id", "instance_id"])
     instance_of = dict(zip(table["patch_id"].to_pylist(), table["instance_id"].to_pylist(), strict=True))
+    if config.least_train_views:
+        trained = Counter(instance_of[name] for name in store.patch_ids(kept=True, split=config.split, part="train"))
+        scored = [name for name in scored if trained[instance_of[name]] >= config.least_train_views]
     if config.protocol == "input-view":
         pairs = [ViewPair(patch_id, patch_id, instance_of[patch_id]) for patch_id in scored]
     else:

@@ -42,6 +42,10 @@ class Box3D:
         cube = self.center.new_tensor(CUBE_CORNERS)
         return (cube * self.size[..., None, :] / 2) @ self.rotation.mT + self.center[..., None, :]
 
+    def select(self, rows: slice) -> "Box3D":
+        """Some of the batch entries."""
+        return Box3D(self.center[rows], self.size[rows], self.rotation[rows])
+
     def to(self, device: torch.device | str) -> "Box3D":
         """The same box on another device."""
         return Box3D(self.center.to(device), self.size.to(device), self.rotation.to(device))

@@ -5,6 +5,7 @@ gamma(position) and z_s only; colour adds the direction and z_t, so a recoloured
 """
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -40,8 +41,11 @@ class CarNeRFConfig:
     """Layers of the trunk, the first included."""
     skip_after: int | None = 5
     """Layer after whose activation position and shape code are added again (counted from 1); None: no skip."""
+    position_encoding: Literal["integrated", "points"] = "integrated"
+    """"integrated": of the cone's Gaussian, which fades what a pixel cannot resolve; "points": of its mean alone, as
+    NeRF and AutoRF do."""
     position_frequencies: int = 16
-    """Octaves of the integrated positional encoding."""
+    """Octaves of the positional encoding."""
     direction_frequencies: int = 4
     """Octaves of the direction's plain encoding."""
     released_encoding: bool = False
@@ -137,6 +141,8 @@ class CarNeRFField(nn.Module):
 
     def _encode_position(self, gaussians: Gaussians) -> Float[Tensor, "batch ray sample feature"]:
         count = self.config.position_frequencies
+        if self.config.position_encoding == "points":
+            return positional_encoding(gaussians.mean, octaves(count, gaussians.mean))
         if not self.config.released_encoding:
             return integrated_positional_encoding(gaussians.mean, gaussians.variance, octaves(count, gaussians.mean))
         frequencies = released_frequencies(count, gaussians.mean)

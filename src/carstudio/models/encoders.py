@@ -19,6 +19,8 @@ from carstudio.hub import load_from_hub
 logger = logging.getLogger(__name__)
 
 RESNET34_HUB_NAME = "microsoft/resnet-34"
+SMALL_CHANNELS = (32, 64, 96, 128)
+SMALL_PYRAMID_FEATURES = sum(SMALL_CHANNELS)
 DEPTHS, WIDTHS = [3, 4, 6, 3], [64, 128, 256, 512]  # of ResNet-34
 
 
@@ -26,14 +28,15 @@ DEPTHS, WIDTHS = [3, 4, 6, 3], [64, 128, 256, 512]  # of ResNet-34
 class EncoderConfig:
     """Which encoder turns the crop into features."""
 
-    kind: Literal["resnet34", "small"] = "resnet34"
-    """"resnet34": the paper's; "small": a few convolutions, 4 ms a patch on one core."""
+    kind: Literal["resnet34", "small", "small-pyramid"] = "resnet34"
+    """"resnet34": the paper's; "small": a few convolutions, 4 ms a patch on one core; "small-pyramid": as resnet34 is
+    built, stages up-sampled and joined, of a few convolutions (small rows of the tables)."""
     side_px: int = 128
     """Side of the square the crop is resized to (released: 128)."""
     pretrained: str | None = RESNET34_HUB_NAME
     """Hub name or folder of ImageNet weights for resnet34; None: start from random weights."""
     num_features: int = 512
-    """Length of the feature vector (512 for resnet34, fixed)."""
+    """Length of the feature vector (512 for resnet34 and 320 for small-pyramid, fixed)."""
     sees_mask: bool = False
     """Also feed the mask as a fourth channel (small only; the paper's encoder sees the photo alone)."""
 
@@ -41,10 +44,13 @@ class EncoderConfig:
         if self.kind == "resnet34":
             assert self.num_features == 512, "resnet34 gives 512 features"
             assert not self.sees_mask, "resnet34 sees the photo alone"
+        if self.kind == "small-pyramid":
+            assert self.num_features == SMALL_PYRAMID_FEATURES, "small-pyramid gives 320 features"
+            assert not self.sees_mask, "small-pyramid sees the photo alone"
 
 
 class ResNet34Encoder(nn.Module):
-    """The paper's global encoder; 512 features."""
+    """The paper's encoder; 512 features."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -75,15 +81,49 @@ class ResNet34Encoder(nn.Module):
     def forward(
         self, image: Float[Tensor, "batch 3 side side"], mask: Float[Tensor, "batch side side"]
     ) -> Float[Tensor, "batch 512"]:
-        """Global features; `mask` is ignored, as in the paper."""
+        """Global features: the map's maxima. `mask` is ignored, as in the paper."""
+        return self.feature_map(image).amax(dim=(-2, -1))
+
+    def feature_map(self, image: Float[Tensor, "batch 3 side side"]) -> Float[Tensor, "batch 512 rows columns"]:
+        """Features at half the photo's resolution, for models that look up single pixels."""
         stem = self.embedder((image - 0.5) / 0.5)
         features, maps = self.pool(stem), [stem]
         for stage in self.stages:
             features = stage(features)
             maps.append(features)
-        size = stem.shape[-2:]
-        resized = [nn.functional.interpolate(m, size, mode="bilinear", align_corners=True) for m in maps]
-        return torch.cat(resized, dim=1).amax(dim=(-2, -1))
+        return joined(maps)
+
+
+def joined(maps: list[Tensor]) -> Float[Tensor, "batch feature rows columns"]:
+    """Maps up-sampled to the first one's size and joined (PixelNeRF: bilinear, the corners' centres aligned)."""
+    size = maps[0].shape[-2:]
+    resized = [nn.functional.interpolate(m, size, mode="bilinear", align_corners=True) for m in maps]
+    return torch.cat(resized, dim=1)
+
+
+class SmallPyramid(nn.Module):
+    """The paper's encoder in small: four strided convolutions, their maps joined; 320 features."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        pairs = pairwise((3, *SMALL_CHANNELS))
+        self.stages = nn.ModuleList(
+            nn.Sequential(nn.Conv2d(inside, outside, 3, stride=2, padding=1), nn.GroupNorm(8, outside), nn.SiLU())
+            for inside, outside in pairs
+        )
+
+    def forward(
+        self, image: Float[Tensor, "batch 3 side side"], mask: Float[Tensor, "batch side side"]
+    ) -> Float[Tensor, "batch feature"]:
+        """Global features: the map's maxima. `mask` is ignored."""
+        return self.feature_map(image).amax(dim=(-2, -1))
+
+    def feature_map(self, image: Float[Tensor, "batch 3 side side"]) -> Float[Tensor, "batch feature rows columns"]:
+        """Features at half the photo's resolution."""
+        maps = [(image - 0.5) / 0.5]
+        for stage in self.stages:
+            maps.append(stage(maps[-1]))
+        return joined(maps[1:])
 
 
 class SmallEncoder(nn.Module):
@@ -91,7 +131,7 @@ class SmallEncoder(nn.Module):
 
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
-        channels = [4 if config.sees_mask else 3, 32, 64, 96, 128]
+        channels = [4 if config.sees_mask else 3, *SMALL_CHANNELS]
         layers: list[nn.Module] = []
         for inside, outside in pairwise(channels):
             layers += [nn.Conv2d(inside, outside, 3, stride=2, padding=1), nn.GroupNorm(8, outside), nn.SiLU()]
@@ -111,7 +151,9 @@ class SmallEncoder(nn.Module):
 
 def build_encoder(config: EncoderConfig) -> nn.Module:
     """The encoder a config names, with random weights (`load_imagenet` replaces them)."""
-    return ResNet34Encoder() if config.kind == "resnet34" else SmallEncoder(config)
+    if config.kind == "resnet34":
+        return ResNet34Encoder()
+    return SmallPyramid() if config.kind == "small-pyramid" else SmallEncoder(config)
 
 
 def load_imagenet(encoder: nn.Module, config: EncoderConfig) -> str:

@@ -39,16 +39,39 @@ class PatchBatch:
 
 
 @dataclass(frozen=True)
+class PixelFeatures:
+    """A feature map over the photo that was encoded, and the camera and box that say where a point of the car is in it.
+
+    The map covers the whole image of `camera`, at any resolution.
+    """
+
+    map: Float[Tensor, "batch feature rows columns"]
+    camera: Camera
+    box: Box3D
+
+    def select(self, rows: slice) -> "PixelFeatures":
+        """Some of the batch entries."""
+        camera = Camera(self.camera.intrinsics[rows], self.camera.width, self.camera.height)
+        return PixelFeatures(self.map[rows], camera, self.box.select(rows))
+
+
+@dataclass(frozen=True)
 class Latents:
-    """Codes of cars: what they are shaped like and what they look like (the paper's z_shape, z_texture)."""
+    """Codes of cars: what they are shaped like and what they look like (the paper's z_shape, z_texture).
+
+    Models with pixel-aligned features (PixelNeRF) have `pixels` as well, and may have codes of length 0; what is done
+    with codes (fitting, recolouring, the car file) is not possible with those.
+    """
 
     shape: Float[Tensor, "batch shape_code"]
     texture: Float[Tensor, "batch texture_code"]
+    pixels: PixelFeatures | None = None
 
     def select(self, index: int | slice) -> "Latents":
         """Latents of some of the batch entries, still a batch."""
         rows = slice(index, index + 1) if isinstance(index, int) else index
-        return Latents(self.shape[rows], self.texture[rows])
+        pixels = None if self.pixels is None else self.pixels.select(rows)
+        return Latents(self.shape[rows], self.texture[rows], pixels)
 
 
 class CategoryModel(nn.Module):
@@ -57,12 +80,18 @@ class CategoryModel(nn.Module):
     encoder_side_px: int
     tile_px: int = 1
     """Side of the square of neighbouring pixels whose rays the model likes to get together when an image is drawn."""
+    is_coded: bool = True
+    """Whether a car is its two codes; not where features of single pixels are looked up."""
     chunk_rays: int = 8192
     """Rays of an image that are traced at a time, for memory's sake."""
 
     def load_pretrained_parts(self) -> str:
         """Load what a config asks to start from (an ImageNet encoder); says in words what the encoder starts from."""
         return "random weights"
+
+    def code_parameters(self) -> tuple[nn.Parameter, ...]:
+        """Parameters that are codes of the cars trained on (auto-decoders); they may learn at a rate of their own."""
+        return ()
 
     def encode(self, patches: PatchBatch) -> Latents:
         """Latents of the cars in the patches."""

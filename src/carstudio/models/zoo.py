@@ -6,29 +6,43 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from carstudio.errors import InputError
+from carstudio.models.autorf import AutoRF, AutoRFConfig
 from carstudio.models.car_gaussians import CarGaussians, CarGaussiansConfig
 from carstudio.models.car_nerf import CarNeRF, CarNeRFConfig
+from carstudio.models.code_nerf import CodeNeRF, CodeNeRFConfig
 from carstudio.models.interface import CategoryModel
+from carstudio.models.pixel_nerf import PixelNeRF, PixelNeRFConfig
 
-ModelConfig = CarNeRFConfig | CarGaussiansConfig
+ModelConfig = CarNeRFConfig | CarGaussiansConfig | AutoRFConfig | PixelNeRFConfig | CodeNeRFConfig
 
 MODELS: dict[str, tuple[type[Any], type[CategoryModel]]] = {
     "car-nerf": (CarNeRFConfig, CarNeRF),
     "car-gaussians": (CarGaussiansConfig, CarGaussians),
+    "autorf": (AutoRFConfig, AutoRF),
+    "pixelnerf": (PixelNeRFConfig, PixelNeRF),
+    "code-nerf": (CodeNeRFConfig, CodeNeRF),
 }
+
+
+def with_cars(config: ModelConfig, instance_ids: tuple[str, ...]) -> ModelConfig:
+    """The config told which cars it is trained on, where its model keeps a code for each (a field `cars`)."""
+    if "cars" not in {field.name for field in dataclasses.fields(config)}:
+        return config
+    changes: dict[str, Any] = {"cars": instance_ids}
+    return dataclasses.replace(config, **changes)
 
 
 def build_model(config: ModelConfig) -> CategoryModel:
     """A model with fresh random weights (torch's global generator)."""
     for config_class, model_class in MODELS.values():
-        if isinstance(config, config_class):
+        if type(config) is config_class:
             return model_class(config)
     raise AssertionError(f"no model for {type(config).__name__}")
 
 
 def config_to_json(config: ModelConfig) -> dict[str, Any]:
     """`{"kind": name, ...fields}`, plain JSON values."""
-    kind = next(name for name, (config_class, _) in MODELS.items() if isinstance(config, config_class))
+    kind = next(name for name, (config_class, _) in MODELS.items() if type(config) is config_class)
     return {"kind": kind, **dataclasses.asdict(config)}
 
 

@@ -1,6 +1,5 @@
 """The cars of a scene: CAR folders below `cars/`, found by name, checked by sha256, opened with their model."""
 
-import shutil
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -9,6 +8,7 @@ from carstudio.errors import InputError
 from carstudio.files import inside, sha256_file, write_bytes
 from carstudio.fitting.car_file import DESCRIPTION, TENSORS, Car, load_car, put_weights, save_car
 from carstudio.models.interface import CategoryModel
+from carstudio.scene.edit_file import nearest
 from carstudio.scene.graph import CarRef, Scene
 from carstudio.training.bundled import bundled_models
 from carstudio.training.checkpoint import describe_model, load_model
@@ -20,10 +20,11 @@ _KEPT_FILES = (TENSORS, DESCRIPTION, PATCH, PATCH_MASK, PATCH_DESCRIPTION)
 
 @dataclass(frozen=True)
 class CarShelf:
-    """The folder `scene_folder/cars`. `models` are further folders of models that cars may have been made with."""
+    """The folder `scene_folder/cars`; further models that cars may be made with; CAR folders from outside (`more`)."""
 
     scene_folder: Path
     models: tuple[Path, ...] = ()
+    more: tuple[Path, ...] = ()
     _loaded: dict[str, CategoryModel] = field(default_factory=dict, repr=False, compare=False)
 
     def folder(self, name: str) -> Path:
@@ -105,12 +106,31 @@ def copy_cars(scene: Scene, source: CarShelf, target: CarShelf) -> Scene:
     return replace(scene, tracks=tracks)
 
 
+def find_car(scene: Scene, shelf: CarShelf, name: str) -> CarRef:
+    """The car that an edit names: `track:ID`, a car of the scene's `cars/`, one of `shelf.more`, or a bundled one.
+
+    Cars from outside are copied onto the shelf. `InputError` names what there is.
+    """
+    kind, _, track_id = name.partition(":")
+    if kind == "track" and track_id:
+        track = scene.tracks.get(track_id)
+        if track is None or track.car is None:
+            there = [key for key, each in scene.tracks.items() if each.car is not None]
+            raise InputError(f"no car of a track {track_id!r}{nearest(track_id, there, 'tracks with a car')}")
+        return track.car
+    if name in shelf.names():
+        return shelf.ref(name)
+    outside = {**bundled_cars(), **{path.resolve().name: path for path in shelf.more}}
+    if name in outside:
+        return shelf.take(outside[name], name)
+    known = [*shelf.names(), *outside]
+    raise InputError(
+        f"no car {name!r}{nearest(name, known, 'cars')}; another track's car is track:ID, a CAR folder is made known "
+        "with --cars FOLDER"
+    )
+
+
 def bundled_cars() -> dict[str, Path]:
     """Cars that come with the package: name -> folder."""
     root = Path(next(iter(bundled_models().values()))).parent if bundled_models() else Path()
     return {path.parent.name: path.parent for path in sorted(root.glob(f"*/{DESCRIPTION}"))}
-
-
-def remove_car(shelf: CarShelf, name: str) -> None:
-    """Delete a car's folder."""
-    shutil.rmtree(shelf.folder(name), ignore_errors=True)

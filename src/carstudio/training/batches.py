@@ -3,6 +3,8 @@
 The sampler has no state: the patches of step k are found from the seed alone, so a run resumes in mid-epoch exactly.
 """
 
+import hashlib
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -13,6 +15,8 @@ from torch import Tensor
 
 from carstudio.dataset.patch import MaskValue
 from carstudio.dataset.pixels import PatchCache, PreparedPatch, mirror_patch
+from carstudio.dataset.store import PatchStore
+from carstudio.errors import InputError
 from carstudio.geometry.box3d import Box3D
 from carstudio.geometry.camera import Camera
 from carstudio.models.interface import PatchBatch
@@ -27,6 +31,30 @@ def generator_for(seed: int, step: int, stream: str, row: int = 0) -> torch.Gene
     """A CPU generator for one purpose of one step (and one row of its batch); none of them share numbers."""
     mixed = seed * 0x9E3779B97F4A7C15 + step * 0xBF58476D1CE4E5B9 + _STREAMS[stream] * 0x94D049BB133111EB
     return torch.Generator().manual_seed((mixed + row * 0xD6E8FEB86659FD93) % 2**63)
+
+
+def training_patches(
+    store: PatchStore, *, split: str | None, most_cars: int | None = None, least_views: int = 1
+) -> dict[str, str]:
+    """patch_id -> instance_id of the kept patches to train on, in store order; `InputError` when there are none.
+
+    `most_cars` takes the cars whose ids have the smallest hashes: 100 cars are among 300 of the same store. Cars with
+    fewer than `least_views` photos are left out before.
+    """
+    kept = set(store.patch_ids(kept=True, split=split, part="train" if split else "all"))
+    table = store.table(["patch_id", "instance_id"])
+    pairs = zip(table["patch_id"].to_pylist(), table["instance_id"].to_pylist(), strict=True)
+    found = {patch_id: instance_id for patch_id, instance_id in pairs if patch_id in kept}
+    views = Counter(found.values())
+    cars = sorted(
+        (car for car, count in views.items() if count >= least_views),
+        key=lambda car: hashlib.sha256(car.encode()).hexdigest(),
+    )
+    chosen = set(cars[:most_cars])
+    if not chosen:
+        which = f" of cars with {least_views} or more photos" if least_views > 1 else ""
+        raise InputError(f"{store.path}: no kept patch{which} in the training part of split {split!r}")
+    return {patch_id: car for patch_id, car in found.items() if car in chosen}
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ LIMITS = {
     "most": (1, 16_384),
     "tint_width": (0, 16_384),
     "position_frequencies": (1, 32),
-    "direction_frequencies": (1, 32),
+    "direction_frequencies": (0, 32),
 }
 
 

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from carstudio.models.interface import Latents
 from carstudio.rendering.volume import Rendering
 
 
@@ -21,6 +22,10 @@ class LossConfig:
     """"masked": only car pixels (Eq. 6); "whole-crop": all pixels, the background against black."""
     mask_weight: float = 1.0
     """lambda_s of Eq. 8 (released: 1); 0 goes with "whole-crop", or nothing would form a silhouette."""
+    mask_error: Literal["squared", "log"] = "squared"
+    """"squared": Eq. 7; "log": AutoRF's occupancy loss, the logarithm of how likely the opacity makes the mask."""
+    code_weight: float = 0.0
+    """Weight of the codes' lengths (CodeNeRF: 1e-4); 0: codes are free."""
     exposed_share: float = 0.0
     """Share of the colour term that is taken after the gain that suits each photo best (not in the paper): exposure is
     a camera's whim, and a model that follows it learns details later."""
@@ -51,7 +56,7 @@ def training_loss(
             plain = plain + config.exposed_share * (exposed - plain)
         terms[f"colour_{name}"] = weight * plain
         if config.mask_weight:
-            error = (rendering.opacity - alpha) ** 2
+            error = mask_error(rendering.opacity, alpha, config.mask_error)
             terms[f"mask_{name}"] = weight * config.mask_weight * (share * error).sum()
     return terms
 
@@ -76,6 +81,25 @@ def colour_error(
     if kind == "masked":
         return alpha * ((rendered - rgb) ** 2).mean(dim=-1)
     return ((rendered - alpha[..., None] * rgb) ** 2).mean(dim=-1)
+
+
+def mask_error(
+    opacity: Float[Tensor, "batch ray"], alpha: Float[Tensor, "batch ray"], kind: Literal["squared", "log"]
+) -> Float[Tensor, "batch ray"]:
+    """Opacity against the mask per ray: squared (Eq. 7), or -log of the mask's likelihood (AutoRF Eq. 7).
+
+    AutoRF writes -log(y (1/2 - t) + 1/2) with y = 1 on the car, -1 beside it and t the light that gets through; that
+    is the binary cross-entropy of 1 - t. The probability is kept 1e-4 away from 0, so that gradients stay finite.
+    """
+    if kind == "squared":
+        return (opacity - alpha) ** 2
+    likelihood = (2 * alpha - 1) * (opacity - 0.5) + 0.5
+    return -torch.log(likelihood.clamp(min=1e-4))
+
+
+def code_length(latents: Latents) -> Float[Tensor, ""]:
+    """||z_shape|| + ||z_texture||, mean over the cars of a batch: CodeNeRF's regulariser (its Eq. 3)."""
+    return (latents.shape.norm(dim=-1) + latents.texture.norm(dim=-1)).mean()
 
 
 def masked_psnr(rendering: Rendering, rgb: Float[Tensor, "batch ray 3"], alpha: Float[Tensor, "batch ray"]) -> float:

@@ -1,11 +1,11 @@
-"""Fitting one car's latents to its prepared patches: `fitting.optimise` with pixels of patches and our loss."""
+"""Fitting cars to their prepared patches: `fitting.optimise` with pixels of patches and our loss."""
 
-from dataclasses import fields
+from collections.abc import Sequence
 
 import torch
 
 from carstudio.dataset.pixels import PreparedPatch
-from carstudio.fitting.optimise import FitConfig, FitPixels, Fitted, fit, known_hits
+from carstudio.fitting.optimise import FitConfig, FitPixels, Fitted, Watch, fit, known_hits, select_rows
 from carstudio.models.interface import CategoryModel, Latents
 from carstudio.progress import Report, silent
 from carstudio.rendering.volume import Rendering
@@ -17,29 +17,58 @@ _HELD_OUT_RAYS = 512  # per photograph
 
 def fit_patches(
     model: CategoryModel,
-    patches: list[PreparedPatch],
+    patches: Sequence[PreparedPatch],
     config: FitConfig,
     *,
     rays: int = 256,
     seed: int = 0,
     report: Report = silent,
 ) -> Fitted:
-    """Latents (a batch of one) that explain all patches of one car; they start at the mean of the encoded ones.
+    """Latents (a batch of one) that explain all patches of one car: `fit_cars` of one."""
+    return fit_cars(model, [patches], config, rays=rays, seed=seed, report=report)
 
-    `rays` pixels per patch and step, drawn by (seed, step). Runs on the model's device.
+
+def fit_cars(
+    model: CategoryModel,
+    cars: Sequence[Sequence[PreparedPatch]],
+    config: FitConfig,
+    *,
+    rays: int = 256,
+    seed: int = 0,
+    stops_early: bool = True,
+    watch: Watch | None = None,
+    report: Report = silent,
+) -> Fitted:
+    """Latents, one row per car, that explain all its patches; they start at the mean of the encoded ones.
+
+    `rays` pixels per patch and step, drawn by (seed, step, place of the patch among its car's), so that a car is shown
+    the same in any company. `stops_early` looks at pixels of the same patches that no step shows. Runs on the model's
+    device.
     """
     device = next(model.parameters()).device
-    with torch.no_grad():
-        each = model.encode(patch_batch(patches).to(device))
-    start = Latents(each.shape.float().mean(0, keepdim=True), each.texture.float().mean(0, keepdim=True))
+    patches = [patch for car in cars for patch in car]
+    places = [place for car in cars for place in range(len(car))]
+    owner = torch.cat([torch.full((len(car),), i) for i, car in enumerate(cars)]).to(device)
 
     def draw(step: int, rays: int = rays) -> FitPixels:
-        pixels = pixel_batch(patches, rays, generator_for(seed, step, "pixels")).to(device)
-        car = torch.zeros(len(patches), dtype=torch.long, device=device)
-        return FitPixels(pixels.rays, pixels.box, pixels.rgb, pixels.alpha, pixels.is_known, car)
+        generators = [generator_for(seed, step, "pixels", place) for place in places]
+        pixels = pixel_batch(patches, rays, generators).to(device)
+        return FitPixels(pixels.rays, pixels.box, pixels.rgb, pixels.alpha, pixels.is_known, owner)
 
-    held_out = draw(config.steps, _HELD_OUT_RAYS)  # of a step that is never made
-    return fit(model, start, draw, objective, config, held_out=held_out, report=report)
+    held_out = draw(config.steps, _HELD_OUT_RAYS) if stops_early else None  # of a step that is never made
+    start = encode_cars(model, cars)
+    return fit(model, start, draw, objective, config, held_out=held_out, watch=watch, report=report)
+
+
+@torch.no_grad()
+def encode_cars(model: CategoryModel, cars: Sequence[Sequence[PreparedPatch]]) -> Latents:
+    """Codes of cars, one row each: the mean over a car's patches."""
+    device = next(model.parameters()).device
+    each = [model.encode(patch_batch(list(car)).to(device)) for car in cars]
+    return Latents(
+        torch.stack([latents.shape.float().mean(dim=0) for latents in each]),
+        torch.stack([latents.texture.float().mean(dim=0) for latents in each]),
+    )
 
 
 def objective(renderings: tuple[Rendering, ...], pixels: FitPixels) -> torch.Tensor:
@@ -55,8 +84,3 @@ def objective(renderings: tuple[Rendering, ...], pixels: FitPixels) -> torch.Ten
         terms = training_loss(own, pixels.rgb[rows], pixels.alpha[rows], counts[rows], LossConfig(colour="whole-crop"))
         losses += list(terms.values())
     return torch.stack(losses).sum()
-
-
-def select_rows(rendering: Rendering, rows: torch.Tensor) -> Rendering:
-    """Some batch entries of a rendering."""
-    return Rendering(**{part.name: getattr(rendering, part.name)[rows] for part in fields(Rendering)})

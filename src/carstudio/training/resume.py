@@ -15,29 +15,39 @@ from carstudio.tensors import load_tensors, save_tensors
 from carstudio.training.checkpoint import load_weights
 
 STATE = "training.safetensors"
-SLOTS = ("step", "exp_avg", "exp_avg_sq")  # what RAdam keeps of each parameter; step is one number
+SLOTS = ("step", "exp_avg", "exp_avg_sq")  # what all our optimisers keep of each parameter; step is one number
 MAX_STEPS = 2**31
 
 
 @dataclass(frozen=True)
 class TrainingState:
-    """Tensors `model.NAME` and `optimizer.PARAMETER.SLOT`, finished steps, their seconds, what the run began with."""
+    """Tensors `model.NAME` and `optimizer.PARAMETER.SLOT`, finished steps, their seconds by the clock and by the
+    processors, what the run began with.
+    """
 
     tensors: dict[str, Tensor]
     step: int
     seconds: float
     starts_from: str
+    cpu_seconds: float = 0.0
 
     @classmethod
     def of(
-        cls, model: nn.Module, optimizer: torch.optim.Optimizer, *, step: int, seconds: float, starts_from: str
+        cls,
+        model: nn.Module,
+        optimizer: torch.optim.Optimizer,
+        *,
+        step: int,
+        seconds: float,
+        starts_from: str,
+        cpu_seconds: float = 0.0,
     ) -> "TrainingState":
         """Collect the state of a run."""
         tensors = {f"model.{name}": tensor for name, tensor in model.state_dict().items()}
         for name, parameter in model.named_parameters():
             for slot, value in optimizer.state.get(parameter, {}).items():
                 tensors[f"optimizer.{name}.{slot}"] = value
-        return cls(tensors, step, seconds, starts_from)
+        return cls(tensors, step, seconds, starts_from, cpu_seconds)
 
     def into(self, model: nn.Module, optimizer: torch.optim.Optimizer) -> None:
         """Put the state back."""
@@ -49,7 +59,7 @@ class TrainingState:
             for slot in SLOTS:
                 value = self.tensors.get(f"optimizer.{name}.{slot}")
                 if value is not None:
-                    on = "cpu" if slot == "step" else parameter.device
+                    on = "cpu" if slot == "step" and not optimizer.defaults.get("fused") else parameter.device
                     optimizer.state[parameter][slot] = value.to(on)
 
     def _check_slots(self, parameters: dict[str, nn.Parameter]) -> None:
@@ -81,6 +91,7 @@ class TrainingState:
 def save_state(folder: Path, state: TrainingState) -> None:
     """Write the state atomically."""
     metadata = {"step": json.dumps(state.step), "seconds": json.dumps(state.seconds), "starts_from": state.starts_from}
+    metadata["cpu_seconds"] = json.dumps(state.cpu_seconds)
     metadata["sha256"] = checksum(state.tensors, metadata)
     save_tensors(folder / STATE, state.tensors, metadata)
 
@@ -115,11 +126,14 @@ def load_state(folder: Path) -> TrainingState:
         )
     try:
         step, seconds = int(metadata["step"]), float(metadata["seconds"])
+        cpu_seconds = float(metadata.get("cpu_seconds", 0.0))  # older states do not tell
     except (KeyError, ValueError) as error:
         raise InputError(f"{path}: header lacks step or seconds ({error}); it is no training state") from error
-    if not (0 <= step <= MAX_STEPS and 0 <= seconds < math.inf):
-        raise InputError(f"{path}: step {step} and seconds {seconds} must be 0 or more; it is no training state")
-    return TrainingState(tensors, step, seconds, metadata.get("starts_from", ""))
+    if not (0 <= step <= MAX_STEPS and 0 <= seconds < math.inf and 0 <= cpu_seconds < math.inf):
+        raise InputError(
+            f"{path}: step {step} and seconds {seconds}, {cpu_seconds} must be 0 or more; it is no training state"
+        )
+    return TrainingState(tensors, step, seconds, metadata.get("starts_from", ""), cpu_seconds)
 
 
 def checksum(tensors: dict[str, Tensor], metadata: dict[str, str]) -> str:

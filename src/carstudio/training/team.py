@@ -26,6 +26,7 @@ from carstudio.dataset.workers import begin_worker, blocked_stops, start_tracker
 from carstudio.errors import InputError
 
 _LOOPBACK = {"linux": "lo", "darwin": "lo0"}  # gloo would listen where the host's name points to
+_LAST_WORDS_S = 5.0  # that a killed process may take to be gone
 
 
 @dataclass(frozen=True)
@@ -46,16 +47,23 @@ class Team:
         return range(self.rank, count, self.size)
 
     def average(
-        self, parameters: Sequence[Tensor], *, weight: float, means: Sequence[float], from_first: Sequence[float]
-    ) -> tuple[list[float], list[float]]:
-        """Replace gradients by their mean over the team, weighted; the means of other numbers; the first's own numbers.
+        self,
+        parameters: Sequence[Tensor],
+        *,
+        weight: float,
+        means: Sequence[float],
+        from_first: Sequence[float],
+        sums: Sequence[float] = (),
+    ) -> tuple[list[float], list[float], list[float]]:
+        """Replace gradients by their mean over the team, weighted; returns means of other numbers, weighted as well,
+        the first's own numbers, and sums.
 
         `InputError` when another process has ended.
         """
         if self.size == 1:
-            return list(means), list(from_first)
+            return list(means), list(from_first), list(sums)
         said = [value if self.is_first else 0.0 for value in from_first]
-        numbers = torch.tensor([weight, *(weight * value for value in means), *said], dtype=torch.float32)
+        numbers = torch.tensor([weight, *(weight * value for value in means), *said, *sums], dtype=torch.float32)
         with_gradient = [p for p in parameters if p.grad is not None]
         gradients = [p.grad for p in with_gradient if p.grad is not None]
         flat = torch.cat([numbers.to(parameters[0].device), *(g.flatten() * weight for g in gradients)])
@@ -64,8 +72,8 @@ class Team:
         for parameter, part in zip(with_gradient, rest.split([g.numel() for g in gradients]), strict=True):
             parameter.grad = part.view_as(parameter)
         total = max(float(numbers[0]), 1e-8)
-        middle = 1 + len(means)
-        return [float(value) / total for value in numbers[1:middle]], numbers[middle:].tolist()
+        averaged, told, summed = numbers[1:].split([len(means), len(from_first), len(sums)])
+        return [float(value) / total for value in averaged], told.tolist(), summed.tolist()
 
     def _sum(self, flat: Tensor) -> None:
         try:
@@ -180,6 +188,8 @@ def _others(size: int, folder: Path, work: Callable[[Team], Any]) -> Iterator[tu
     finally:
         for process in started:
             process.kill()
+        for process in started:
+            process.join(_LAST_WORDS_S)
 
 
 def _follow(rank: int, size: int, folder: Path, work: Callable[[Team], Any], complaint: Connection) -> None:

@@ -19,13 +19,14 @@ from carstudio.files import remove_partials
 from carstudio.locks import LOCK_NAME, FolderLock
 from carstudio.models.car_nerf import CarNeRFConfig
 from carstudio.models.interface import CategoryModel
-from carstudio.models.zoo import ModelConfig, build_model
+from carstudio.models.zoo import ModelConfig, build_model, with_cars
 from carstudio.progress import Report, silent
 from carstudio.rendering.rays import to_canonical
-from carstudio.training.batches import Mirroring, StepSampler, Supervision, generator_for
+from carstudio.training.batches import Mirroring, StepSampler, Supervision, generator_for, training_patches
 from carstudio.training.checkpoint import describe_model, load_weights_of, save_model
 from carstudio.training.log import LOG, TrainingLog
-from carstudio.training.losses import LossConfig, masked_psnr, training_loss
+from carstudio.training.losses import LossConfig, code_length, masked_psnr, training_loss
+from carstudio.training.optimizers import OptimizerName, build_optimizer
 from carstudio.training.precision import Precision, autocast, resolve_precision
 from carstudio.training.resume import STATE, TrainingState, load_state, save_state
 from carstudio.training.schedule import ScheduleConfig, learning_rate
@@ -56,6 +57,17 @@ class TrainConfig:
     """Length of the run."""
     minutes: float | None = None
     """Stop after this much time instead, and let the learning rate follow the clock."""
+    cpu_seconds: float | None = None
+    """Stop after so many processor seconds instead, those of all processes of a team together; the learning rate
+    follows them. What rows of a table have in common."""
+    optimizer: OptimizerName = "radam"
+    """radam: the paper's; adamw: CodeNeRF's; adam: one fused kernel, the least work per step."""
+    code_rate: float = 1.0
+    """Learning rate of codes that are kept per car (CodeNeRF), as a multiple of the schedule's."""
+    most_cars: int | None = None
+    """Train on so many of the split's cars only; fewer are always among the more. None: on all."""
+    least_views: int = 1
+    """Leave out cars with fewer photos in the training part (the paper's multi-view comparison: 2)."""
     clip_gradient: float | None = None
     """Largest gradient norm; None: not clipped, as released."""
     precision: Precision = "float32"
@@ -77,6 +89,7 @@ class TrainSummary:
     folder: str
     steps: int
     seconds: float
+    cpu_seconds: float
     rays_per_s: float
     psnr: float
     starts_from: str
@@ -195,19 +208,22 @@ class _Run:
         team: Team,
     ) -> None:
         self.config, self.out, self.device, self.provenance, self.team = config, out, device, provenance, team
-        patch_ids = store.patch_ids(kept=True, split=config.split, part="train" if config.split else "all")
-        if not patch_ids:
-            raise InputError(f"{store.path}: no kept patch in the training part of split {config.split!r}")
+        patches = training_patches(
+            store, split=config.split, most_cars=config.most_cars, least_views=config.least_views
+        )
         torch.manual_seed(config.seed)
-        self.model = build_model(config.model).to(device)
+        self.model_config = with_cars(config.model, tuple(sorted(set(patches.values()))))
+        self.model = build_model(self.model_config).to(device)
         self.starts_from = ""
-        self.optimizer = torch.optim.RAdam(self.model.parameters(), lr=config.schedule.first, eps=1e-8)
-        self.step, self.seconds, self.psnr, self.rays_per_s = 0, 0.0, math.nan, 0.0
+        self.optimizer = build_optimizer(
+            self.model, config.optimizer, rate=config.schedule.first, code_rate=config.code_rate
+        )
+        self.step, self.seconds, self.cpu_seconds, self.psnr, self.rays_per_s = 0, 0.0, 0.0, math.nan, 0.0
         self.is_stopped = False
         cache = PatchCache(store, self.model.encoder_side_px)
         self.sampler = StepSampler(
             cache,
-            patch_ids,
+            list(patches),
             patches_per_step=config.patches_per_step,
             supervision=config.supervision,
             seed=config.seed,
@@ -225,20 +241,24 @@ class _Run:
         if (self.out / STATE).exists():
             self._restore(load_state(self.out))
         elif init is not None:
-            self.starts_from = load_weights_of(init, self.model, self.config.model)
+            self.starts_from = load_weights_of(init, self.model, self.model_config)
         else:
             self.starts_from = f"encoder from {self.model.load_pretrained_parts()}"
         self._resumed_step, self._resumed_seconds = self.step, self.seconds
-        self._started = time.monotonic()
+        self._resumed_cpu_seconds = self.cpu_seconds
+        self._started, self._cpu_started = time.monotonic(), time.process_time()
 
     def _restore(self, state: TrainingState) -> None:
         state.into(self.model, self.optimizer)
-        self.step, self.seconds, self.starts_from = state.step, state.seconds, state.starts_from
+        self.step, self.starts_from = state.step, state.starts_from
+        self.seconds, self.cpu_seconds = state.seconds, state.cpu_seconds
 
     def fraction(self) -> float:
         """Share of the run's budget that is spent."""
         if self.config.minutes is not None:
             return min(1.0, self.seconds / (60 * self.config.minutes))
+        if self.config.cpu_seconds is not None:
+            return min(1.0, self.cpu_seconds / self.config.cpu_seconds)
         return self.step / self.config.steps
 
     def is_done(self) -> bool:
@@ -248,6 +268,8 @@ class _Run:
         """(done, total) for a progress bar: steps, or seconds of a run by time."""
         if self.config.minutes is not None:
             return round(self.seconds), round(60 * self.config.minutes)
+        if self.config.cpu_seconds is not None:
+            return round(self.cpu_seconds), round(self.config.cpu_seconds)
         return self.step, self.config.steps
 
     def _elapsed(self) -> float:
@@ -261,7 +283,7 @@ class _Run:
         config = self.config
         rate = learning_rate(config.schedule, self.step, self.fraction())
         for group in self.optimizer.param_groups:
-            group["lr"] = rate
+            group["lr"] = rate * group["multiple"]
         rows = self.team.share(config.patches_per_step)
         patches, pixels = self.sampler.batch(self.step, config.rays_per_patch, rows)
         patches, pixels = patches.to(self.device), pixels.to(self.device)
@@ -273,17 +295,21 @@ class _Run:
             renderings = self.model.render_levels(pixels.rays, latents, pixels.box, jitter)
         counts = pixels.is_known & to_canonical(pixels.rays, pixels.box).hit
         terms = training_loss(renderings, pixels.rgb, pixels.alpha, counts, config.loss)
+        if config.loss.code_weight:
+            terms["codes"] = config.loss.code_weight * code_length(latents)
         loss = torch.stack(list(terms.values())).sum()
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         values = [float(term.detach()) for term in terms.values()]
         seen = masked_psnr(renderings[-1], pixels.rgb, pixels.alpha * counts)
-        (*values, self.psnr), (self.seconds, stops) = self.team.average(
+        (*values, self.psnr), (self.seconds, stops), (spent,) = self.team.average(
             list(self.model.parameters()),
             weight=float(counts.sum()),
             means=[*values, seen],
             from_first=[self._elapsed(), float(should_stop())],
+            sums=[time.process_time() - self._cpu_started],
         )
+        self.cpu_seconds = self._resumed_cpu_seconds + spent
         figures, self.is_stopped = dict(zip(terms, values, strict=True)), stops > 0
         self._refuse_nan(figures, patches.instance_ids)
         if config.clip_gradient is not None:
@@ -311,6 +337,8 @@ class _Run:
         row: dict[str, Any] = {"step": self.step, **figures}
         if self.config.minutes is not None:
             row["seconds"] = round(self.seconds, 3)
+        if self.config.cpu_seconds is not None:
+            row["cpu_seconds"] = round(self.cpu_seconds, 3)
         self.trainlog.write(row)
 
     def save(self) -> None:
@@ -323,14 +351,19 @@ class _Run:
             "starts_from": self.starts_from,
             "step": self.step,
         }
-        save_model(self.out, self.model, self.config.model, provenance)
+        save_model(self.out, self.model, self.model_config, provenance)
         self.save_state()
 
     def save_state(self) -> None:
         """What the run goes on from; the log reaches the disk before it."""
         self.trainlog.sync()
         state = TrainingState.of(
-            self.model, self.optimizer, step=self.step, seconds=self.seconds, starts_from=self.starts_from
+            self.model,
+            self.optimizer,
+            step=self.step,
+            seconds=self.seconds,
+            cpu_seconds=self.cpu_seconds,
+            starts_from=self.starts_from,
         )
         save_state(self.out, state)
 
@@ -342,6 +375,7 @@ class _Run:
             folder=str(self.out),
             steps=self.step,
             seconds=round(self.seconds, 3),
+            cpu_seconds=round(self.cpu_seconds, 3),
             rays_per_s=round(self.rays_per_s, 1),
             psnr=round(self.psnr, 3),
             starts_from=self.starts_from,

@@ -30,8 +30,8 @@ def ray_hits(
     """The first `most` Gaussians along each ray x + t d whose alpha is worth showing, from front to back.
 
     Gives alpha (0 where there are fewer), t of the peak and the Gaussian's number. `directions` are unit vectors and
-    `points` within two units of the origin. Peaks at t <= `nearest` (the camera) count as missed. Gradients flow to the
-    splats through alpha and t, in closed form; points and directions get none.
+    `points` within two units of the origin. Peaks at t <= `nearest` (the camera) count as missed. Gradients flow
+    through alpha and t, in closed form, to the splats and, where they are asked for, to points and directions.
     """
     features = torch.cat(ray_features(points, directions), dim=-1)
     return hits_of_features(splat_coefficients(splats), splats.opacity, features, nearest, most=most)
@@ -119,6 +119,7 @@ class _Hits(torch.autograd.Function):
         grad_opacity.scatter_add_(-1, index.flatten(1), (grad_alpha * peak).flatten(1))
         to_distance2 = grad_alpha * alpha * -0.5
         grad_coefficients = torch.zeros_like(coefficients)
+        grad_features = torch.zeros_like(features) if ctx.needs_input_grad[2] else None
         for entries, rays in _chunks(features, coefficients.shape[-1]):
             part, rows, at = features[entries, rays], index[entries, rays], t[entries, rays]
             g = to_distance2[entries, rays]
@@ -133,7 +134,10 @@ class _Hits(torch.autograd.Function):
             for slope, first, width in ((g, 0, 10), (to_b, 10, 9), (to_e, 19, 6)):
                 dense.scatter_(-1, rows, slope)  # the same places each time: no need to clear them
                 into[:, :width] += part[..., first : first + width].mT @ dense
-        return grad_coefficients, grad_opacity, None, None, None
+                if grad_features is not None:
+                    own = coefficients[entries, :width].mT
+                    grad_features[entries, rays, first : first + width] = dense @ own
+        return grad_coefficients, grad_opacity, grad_features, None, None
 
 
 def _chunks(features: Tensor, num_splats: int) -> list[tuple[slice, slice]]:

@@ -1,0 +1,1 @@
+"""The paper's tables: models trained alike, scored alike, set beside the paper's own figures."""

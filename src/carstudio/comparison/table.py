@@ -1,0 +1,56 @@
+"""`zero-shot` and `multi-view`: the paper's Tables II and III, row by row, then the documents."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from carstudio import __version__
+from carstudio.comparison.budgets import Budget, within
+from carstudio.comparison.document import Document, comparison_tables, write_document
+from carstudio.comparison.grid import qualitative_grid
+from carstudio.comparison.rows import Row
+from carstudio.comparison.running import Finished, Work, finish_row
+from carstudio.evaluation.results import write_rows
+from carstudio.evaluation.tables import Table
+
+TITLES = {
+    "zero-shot": "Single-view supervision, cars never seen (the paper's Table II)",
+    "multi-view": "Single-view against multi-view supervision (the paper's Table III)",
+    "scaling": "More training cars, recolouring, and smaller images",
+}
+
+
+def make_table(name: str, work: Work, rows: Sequence[Row], budget: Budget) -> list[Table]:
+    """Finish every row, write `NAME.md`, `.tex`, `.html`, `NAME.png` and `rows.jsonl`; returns the tables."""
+    finished = []
+    for done, row in enumerate(rows):
+        work.report(name, done, len(rows), row.name)
+        finished.append(finish_row(work, replace(row, config=within(budget, row.config))))
+    work.report(name, len(rows), len(rows), "")
+    tables = comparison_tables(finished, title=TITLES[name])
+    grid = qualitative_grid(work, rows)
+    caption = "Input photo, each model's colour and opacity (Turbo: dark blue 0, dark red 1), truth."
+    pictures = () if grid is None else ((f"{name}.png", caption, grid),)
+    document = Document(name, TITLES[name], facts(work, finished, budget), tuple(tables), pictures)
+    write_rows(
+        work.out / "rows.jsonl",
+        [score for done in finished for score in done.scores],
+        replace(finished[0].header, command=work.command),
+    )
+    write_document(document, work.out)
+    return tables
+
+
+def facts(work: Work, finished: Sequence[Finished], budget: Budget) -> tuple[tuple[str, str], ...]:
+    """What holds for all rows: budget, size, data, split, seed, cost, command."""
+    parts = {part: work.store.patch_ids(split=work.split, part=part) for part in ("train", "test")}
+    spent = sum(float(done.summary["cpu_seconds"]) for done in finished)
+    by_row = "; ".join(f"{d.row.name} {d.summary['steps']:,} / {d.summary['cpu_seconds']:,.0f}" for d in finished)
+    return (
+        ("budget", str(budget)),
+        ("data", f"{work.store.path.name}, sha256 {work.store.data_sha256[:16]}"),
+        ("split", f"{work.split}: {len(parts['train']):,} photos train, {len(parts['test']):,} are held out"),
+        ("scored", "all held-out photos" if work.limit is None else f"at most {work.limit} photos per protocol"),
+        ("seed", str(work.seed)),
+        ("cost", f"{spent:,.0f} CPU-seconds of training in all (steps / CPU-seconds: {by_row})"),
+        ("made by", f"carstudio {__version__}: {work.command}"),
+    )
