@@ -8,6 +8,7 @@ import tyro
 from tyro.conf import subcommand
 
 from carstudio.commands.command import Outcome, Output, provenance
+from carstudio.commands.scene_checks import Gap, Replay
 from carstudio.devices import pick_device
 from carstudio.fitting.optimise import FitConfig
 from carstudio.locks import FolderLock
@@ -122,6 +123,8 @@ Scenes = (
     Annotated[FromKittiMot, subcommand("from-kitti-mot")]
     | Annotated[FromKittiDet, subcommand("from-kitti-det")]
     | Annotated[Info, subcommand("info")]
+    | Annotated[Replay, subcommand("replay")]
+    | Annotated[Gap, subcommand("gap")]
 )
 
 
