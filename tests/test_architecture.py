@@ -33,7 +33,7 @@ MAY_IMPORT = {
     "fitting": FIELD | BASE,
     "training": FIELD | DATA | BASE | {"fitting"},
     "evaluation": FIELD | DATA | BASE | {"fitting", "training"},
-    "scene": FIELD | DATA | BASE | {"fitting", "training"},
+    "scene": FIELD | DATA | BASE | {"fitting", "training", "evaluation", "report"},
     "lift": FIELD | DATA | BASE | {"fitting", "training", "evaluation"},
     "review": DATA | BASE,
     "report": FIELD | DATA | BASE | {"fitting", "training", "evaluation"},

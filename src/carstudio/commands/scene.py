@@ -8,6 +8,7 @@ import tyro
 from tyro.conf import subcommand
 
 from carstudio.commands.command import Outcome, Output, provenance
+from carstudio.commands.scene_checks import Gap, Replay
 from carstudio.devices import pick_device
 from carstudio.errors import InputError
 from carstudio.files import write_json
@@ -189,6 +190,8 @@ Scenes = (
     | Annotated[FromKittiDet, subcommand("from-kitti-det")]
     | Annotated[Info, subcommand("info")]
     | Annotated[Recolour, subcommand("recolour")]
+    | Annotated[Replay, subcommand("replay")]
+    | Annotated[Gap, subcommand("gap")]
 )
 
 

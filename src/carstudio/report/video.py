@@ -38,15 +38,16 @@ def write_mp4(path: Path | str, frames: Sequence[Pixels], fps: float) -> str:
     """An MP4, atomically; returns the codec taken, the first of `CODECS` that works here.
 
     The file is opened again and its frames are counted before it takes its name. Odd sides gain a repeated edge pixel,
-    because the codecs halve the colour resolution.
+    because the codecs halve the colour resolution. Frames are taken one at a time (again for a second codec), so a
+    sequence that reads them from files needs memory for one.
     """
-    _check(frames, fps)
-    even = [np.pad(frame, ((0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)), "edge") for frame in frames]
+    assert len(frames) > 0, "a moving picture needs a frame"
+    assert fps > 0, fps
     if Path(path).suffix != ".mp4":
         raise InputError(f"{path}: a video's name must end in .mp4")
     with atomic_path(path) as partial:
         for codec in CODECS:
-            if _encode(partial, even, fps, codec) and count_frames(partial) == len(frames):
+            if _encode(partial, frames, fps, codec) and count_frames(partial) == len(frames):
                 return codec
         raise InputError(
             f"{path}: this OpenCV ({cv2.__version__}) writes none of {', '.join(CODECS)}; "
@@ -55,14 +56,17 @@ def write_mp4(path: Path | str, frames: Sequence[Pixels], fps: float) -> str:
 
 
 def _encode(path: Path, frames: Sequence[np.ndarray], fps: float, codec: str) -> bool:
-    height, width = frames[0].shape[:2]
+    shape = frames[0].shape
+    height, width = shape[0] + shape[0] % 2, shape[1] + shape[1] % 2
     fourcc = cv2.VideoWriter.fourcc(codec[0], codec[1], codec[2], codec[3])
     writer = cv2.VideoWriter(str(path), fourcc, fps, (width, height))
     try:
         if not writer.isOpened():
             return False
         for frame in frames:
-            writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+            assert frame.shape == shape, "all frames must have one size"
+            even = np.pad(frame, ((0, shape[0] % 2), (0, shape[1] % 2), (0, 0)), "edge")
+            writer.write(cv2.cvtColor(even, cv2.COLOR_RGB2BGR))
         return True
     finally:
         writer.release()

@@ -1,6 +1,7 @@
 """New labels for edited frames: boxes as they are placed, 2-D boxes from what is visible, occlusion, truncation."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -158,3 +159,13 @@ def label_line(truth: ObjectTruth, camera_offset: tuple[float, float, float]) ->
         *(f"{value:.6f}" for value in (alpha, *truth.box2d, height, width, length, x, y + height / 2, z, yaw)),
     ]
     return " ".join(columns)
+
+
+def truths_of(record: Mapping[str, Any]) -> list[ObjectTruth]:
+    """The truths in a frame's record."""
+    found = []
+    for value in record["objects"]:
+        box = PlacedBox(*(tuple(value["box"][key]) for key in ("center", "size", "rotation")))
+        box2d = None if value["box2d"] is None else tuple(value["box2d"])
+        found.append(ObjectTruth(**{**value, "box": box, "box2d": box2d}))
+    return found
