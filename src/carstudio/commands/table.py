@@ -7,14 +7,15 @@ from typing import Annotated, Literal
 import tyro
 
 from carstudio.commands.command import Outcome, Output, plain, provenance
-from carstudio.comparison.budgets import BUDGETS, BudgetName
+from carstudio.comparison.budgets import BUDGETS, Budget, BudgetName
 from carstudio.comparison.rows import ROWS, SPLITS, chosen
 from carstudio.comparison.running import Work
+from carstudio.comparison.scaling import make_scaling, scaling_rows
 from carstudio.comparison.table import make_table
 from carstudio.dataset.sources.synthetic import SynthConfig, synthesize
 from carstudio.dataset.store import PatchStore, open_store
 from carstudio.errors import InputError
-from carstudio.evaluation.tables import to_markdown
+from carstudio.evaluation.tables import Table, to_markdown
 from carstudio.files import require_writable
 from carstudio.progress import Report
 from carstudio.signals import held_back_stops
@@ -70,7 +71,6 @@ class MakeTable(Output):
                 raise InputError("--steps does not go with --budget cpu: its rows share processor seconds")
             budget = replace(budget, steps=self.steps)
         budget = replace(budget, scored=self.limit if self.limit is not None else budget.scored)
-        rows = chosen(ROWS[self.name](), self.rows)
         require_writable(self.out / "rows.jsonl")
         with self.progress() as report, held_back_stops() as stops:
             work = Work(
@@ -85,10 +85,15 @@ class MakeTable(Output):
                 report=report,
                 should_stop=lambda: bool(stops),
             )
-            tables = make_table(self.name, work, rows, budget)
+            tables = self._make(work, budget)
         text = "\n".join(to_markdown(table) for table in tables)
         files = [str(self.out / f"{self.name}.{ending}") for ending in ("md", "tex", "html")]
         return Outcome(f"{text}\n{', '.join(files)}", {"files": files, "tables": plain(tables)})
+
+    def _make(self, work: Work, budget: Budget) -> list[Table]:
+        if self.name == "scaling":
+            return make_scaling(work, chosen(scaling_rows(work.store, work.split), self.rows), budget)
+        return make_table(self.name, work, chosen(ROWS[self.name](), self.rows), budget)
 
     def _store(self, report: Report) -> PatchStore:
         if self.data is not None:
