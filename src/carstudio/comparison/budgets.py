@@ -62,7 +62,7 @@ BUDGETS: dict[BudgetName, Budget] = {
         name="cpu",
         cpu_seconds=300.0,
         size=FieldSize(
-            encoder_side_px=64, width=128, code_size=128, samples=20, patches_per_step=16, rays_per_patch=64
+            encoder_side_px=64, width=128, code_size=128, samples=20, patches_per_step=16, rays_per_patch=48
         ),
         scored=100,
     ),
@@ -103,7 +103,7 @@ def _shrunk(config: TrainConfig, budget: Budget) -> TrainConfig:
     return replace(
         config,
         model=model,
-        schedule=ScheduleConfig(first=2e-3, last=1e-4, decay_steps=None, warmup_steps=100),
+        schedule=ScheduleConfig(first=2e-3, last=1e-4, decay_steps=None, warmup_steps=50),
         patches_per_step=size.patches_per_step,
         rays_per_patch=size.rays_per_patch,
         precision="auto",

@@ -21,6 +21,7 @@ GRID = "#7d859033"
 BLUE = "#3b82f6"
 TEAL = "#14a38b"
 AMBER = "#e8833a"
+LINES = (BLUE, TEAL, AMBER, INK, "#a855f7", "#e5484d")
 PIXELS_PER_INCH = 160
 SMOOTHING = 0.9  # weight of the past in the running mean drawn over a noisy curve
 
@@ -79,17 +80,17 @@ def curves(
     figure = Figure(figsize=(8.0, 3.4), layout="constrained", facecolor=ground)
     axes = figure.subplots()
     for number, (name, points) in enumerate(series.items()):
-        colour = (BLUE, TEAL, AMBER, INK)[number % 4]
+        colour = LINES[number % len(LINES)]
         errors = [[p.value - p.low for p in points], [p.high - p.value for p in points]]
         axes.errorbar([p.x for p in points], [p.value for p in points], yerr=errors, color=colour, marker="o",
-                      linestyle="-" if number < 4 else "--", capsize=3, linewidth=1.6, label=name)  # fmt: skip
+                      capsize=3, linewidth=1.6, label=name)  # fmt: skip
     axes.set_xscale("log")
     places = sorted({point.x for points in series.values() for point in points})
     axes.set_xticks(places, [f"{place:,.0f}" for place in places])
     axes.minorticks_off()
     dress(axes, title)
     axes.set_xlabel(x, color=INK, fontsize=9)
-    axes.legend(fontsize=8, frameon=False, labelcolor=INK)
+    figure.legend(fontsize=8, frameon=False, labelcolor=INK, loc="outside right upper")
     return figure_bytes(figure, style, is_transparent=False)
 
 
