@@ -64,7 +64,8 @@ def test_it_equals_the_original(dd3d_data: Path, backbone: Backbone) -> None:
     (fused,) = network.detect(*([part] for part in synthetic_input()))
     assert sorted(choices(fused)) == sorted(choices(plain))
     np.testing.assert_allclose(fused.score_3d, plain.score_3d, atol=7e-4)
-    check_low_precision(network)
+    if backbone == "dla34":
+        check_low_precision(network)
 
 
 def check_input(network: DD3D, reference: Reference) -> None:
@@ -193,22 +194,20 @@ def check_second_input(network: DD3D) -> Detections:
     images, cameras = [image, image.flip(-1)], [camera, camera.flip()]
     assert network.prepare(images).shape == (2, 3, 128, 256)  # no padding
     together = network(network.prepare(images))
-    found = []
-    for photo, picture in enumerate(images):
-        alone = network(network.prepare([picture]))
-        for stride, one, both in zip(network.backbone.strides, alone, together, strict=True):
-            assert one.logits.shape == (1, 5, 128 // stride, 256 // stride)
-            for theirs, (ours, tolerance) in RAW.items():
-                value = getattr(one, ours)[0]
-                assert value.isfinite().all()
-                np.testing.assert_allclose(value, getattr(both, ours)[photo], atol=tolerance, rtol=0, err_msg=theirs)
-        found.append(boxes_of(network, alone, cameras[photo : photo + 1])[0])
-    for one, two in zip(found, boxes_of(network, together, cameras), strict=True):
-        assert choices(one) == choices(two)
-        assert len(one) == 100  # what the reference's notes say of this input
-        assert all(getattr(one, field.name).isfinite().all() for field in fields(one))
-        assert float(one.center[:, 2].min()) >= 0.1 - 1e-6
-    return found[0]
+    alone = network(network.prepare([image]))
+    for stride, one, both in zip(network.backbone.strides, alone, together, strict=True):
+        assert one.logits.shape == (1, 5, 128 // stride, 256 // stride)
+        for theirs, (ours, tolerance) in RAW.items():
+            value = getattr(one, ours)[0]
+            assert value.isfinite().all()
+            np.testing.assert_allclose(value, getattr(both, ours)[0], atol=tolerance, rtol=0, err_msg=theirs)
+    (found,), both = boxes_of(network, alone, [camera]), boxes_of(network, together, cameras)
+    assert choices(found) == choices(both[0]) != choices(both[1])
+    for boxes in (found, *both):
+        assert len(boxes) == 100  # what the reference's notes say of this input
+        assert all(getattr(boxes, field.name).isfinite().all() for field in fields(boxes))
+        assert float(boxes.center[:, 2].min()) >= 0.1 - 1e-6
+    return found
 
 
 def check_low_precision(network: DD3D) -> None:
