@@ -18,6 +18,7 @@ from carstudio.perception.dd3d.decoding import (
     candidates,
     egocentric_from_allocentric,
     metric_depth,
+    place_in_space,
 )
 from carstudio.perception.dd3d.heads import HeadOutputs
 from carstudio.perception.dd3d.kitti import result_text
@@ -100,6 +101,17 @@ def test_depth_is_that_of_equal_size_in_the_image() -> None:
     doubled = Camera(torch.tensor([721.5377, 721.5377, 600.0, 180.0]), 1242, 375).resize(2484, 750)
     single = Camera(torch.tensor([721.5377, 721.5377, 600.0, 180.0]), 1242, 375)
     torch.testing.assert_close(metric_depth(raw, doubled), 2 * metric_depth(raw, single))
+
+
+def test_a_wrong_focal_length_moves_a_box_in_depth_alone() -> None:
+    """(u - cx) / f grows as much less as z grows more: x and y stay (what `bench/focal_error.py` finds on labels)."""
+    truth = torch.tensor([[-3.0, 1.1, 14.0], [2.0, 0.6, 33.0]], dtype=torch.float64)
+    own = Camera(torch.tensor(CAMERA, dtype=torch.float64), 88, 64)
+    raw = truth[:, 2] * 500 * math.hypot(1 / CAMERA[0], 1 / CAMERA[1])
+    for factor in (0.7, 1.0, 1.3):
+        wrong = Camera(own.intrinsics * torch.tensor([factor, factor, 1.0, 1.0]), 88, 64)
+        _, center = place_in_space(torch.eye(4)[:2].double(), raw, own.project(truth), wrong)
+        np.testing.assert_allclose(center, truth * torch.tensor([1.0, 1.0, factor]), rtol=1e-6)
 
 
 def encoded(yaw: float, center: np.ndarray, size: tuple[float, float, float], kind: int) -> list[HeadOutputs]:
