@@ -31,6 +31,16 @@ def test_data(repo_root: Path) -> Path:
     return folder
 
 
+@pytest.fixture(scope="session")
+def dd3d_data(repo_root: Path) -> Path:
+    """Folder with outputs of the original DD3D: CARSTUDIO_DD3D_DATA, else ../shared/dd3d; else skip."""
+    named = os.environ.get("CARSTUDIO_DD3D_DATA")
+    folder = Path(named).expanduser() if named else repo_root.parent / "shared" / "dd3d"
+    if not folder.is_dir():
+        pytest.skip(f"no reference of DD3D at {folder}: set CARSTUDIO_DD3D_DATA to the folder that holds recipe.py")
+    return folder
+
+
 @pytest.fixture(autouse=True)
 def _same_random_numbers() -> None:
     """Seed the global generators that a test might use without asking for its own."""

@@ -40,6 +40,7 @@ VERBS = {
     "export": ("carstudio.commands.export:Export", "car -> GLB or splat PLY"),
     "render": ("carstudio.commands.render:Render", "trained model + photos -> turntables, opacity, depth"),
     "scene": ("carstudio.commands.scene:Scenes", "driving log -> frames and cars to edit"),
+    "edit": ("carstudio.commands.edit:Edit", "scene + edit file -> edited frames with depth, masks and labels"),
     "models": ("carstudio.commands.models:Models", "pretrained networks: which there are, which are here, download"),
     "doctor": ("carstudio.commands.doctor:Doctor", "what is installed, what is missing, what it is for, how to get it"),
 }

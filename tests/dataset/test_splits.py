@@ -3,7 +3,15 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from carstudio.dataset.splits import View, split_as_released, split_by_instance, split_by_view
+from carstudio.dataset.splits import (
+    View,
+    make_split,
+    seen_from,
+    split_as_released,
+    split_by_instance,
+    split_by_view,
+    split_by_yaw,
+)
 
 
 def make_views(counts: list[int]) -> list[View]:
@@ -36,6 +44,16 @@ def test_view_split_by_hand() -> None:
     parts = split_by_view(views)
     by_car = ["".join(parts[v.patch_id][1] for v in views if v.instance_id == f"c-{car}") for car in range(5)]
     assert by_car == ["r", "re", "rre", "rree", "rrrreee"]  # "r" for train, "e" for test
+
+
+def test_yaw_split_by_hand() -> None:
+    """Azimuths in time order; the side that is nearest to the first one's trains, also across 180 degrees."""
+    degrees = [170.0, 90.0, -170.0, 10.0, -100.0, 150.0]
+    views = [View(f"p{i}", "c", i) for i in range(6)] + [View("alone", "d", 0)]
+    given_views = seen_from(views, {f"p{i}": angle for i, angle in enumerate(degrees)})
+    parts = make_split(given_views, by="yaw", test_share=0.5)
+    assert {patch for patch, part in parts.items() if part == "train"} == {"p0", "p2", "p5", "alone"}
+    assert split_by_yaw(views, 2 / 3)["p5"] == "test", "without boxes the first views train"
 
 
 @given(COUNTS, st.randoms())

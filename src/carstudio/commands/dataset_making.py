@@ -10,9 +10,10 @@ from carstudio.commands.build import describe_unfinished
 from carstudio.commands.command import Outcome, Output, plain
 from carstudio.dataset.duplicates import find_duplicates
 from carstudio.dataset.fingerprints import Likeness
+from carstudio.dataset.measured import measure
 from carstudio.dataset.merge import merge_stores
 from carstudio.dataset.runs import write_run
-from carstudio.dataset.splits import SplitBy, count_parts, kept_views, make_split, write_splits
+from carstudio.dataset.splits import SplitBy, count_parts, kept_views, make_split, seen_from, write_splits
 from carstudio.dataset.store import open_store
 from carstudio.errors import InputError
 from carstudio.locks import FolderLock
@@ -52,11 +53,12 @@ class Split(Output):
     name: str
     """The split's name: `splits/NAME.parquet`."""
     by: SplitBy
-    """What is never parted: a car (instance), a sequence, a patch; view: each car's last views in time are tested."""
+    """What is never parted: a car (instance), a sequence, a patch; view: each car's last views in time are tested; yaw:
+    its views from farthest around from the first one."""
     test_share: float = 0.1
     """Share of the cars, sequences, patches, or of each car's views that is tested."""
     seed: int = 0
-    """Another seed, another draw. By view nothing is drawn."""
+    """Another seed, another draw. By view or yaw nothing is drawn."""
     force: bool = False
     """Replace a split of this name."""
 
@@ -68,7 +70,12 @@ class Split(Output):
                 raise InputError(
                     f"{self.store}: has a split {self.name!r} already; choose another --name, or --force to replace it"
                 )
-            parts = make_split(kept_views(store), by=self.by, test_share=self.test_share, seed=self.seed)
+            views = kept_views(store)
+            if self.by == "yaw":
+                measured = measure(store)
+                azimuths = zip(measured.patch_id.tolist(), measured.values["azimuth_deg"].tolist(), strict=True)
+                views = seen_from(views, dict(azimuths))
+            parts = make_split(views, by=self.by, test_share=self.test_share, seed=self.seed)
             store.write_split(self.name, parts)
             settings = {"by": self.by, "test_share": self.test_share, "seed": self.seed}
             write_run(self.store, {"split": {"name": self.name, **settings}})

@@ -1,6 +1,6 @@
 """`carstudio scene ACTION`: make a scene from a driving log, and look into one. One class per action."""
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,14 +10,22 @@ from tyro.conf import subcommand
 from carstudio.commands.command import Outcome, Output, provenance
 from carstudio.commands.scene_checks import Gap, Replay
 from carstudio.devices import pick_device
+from carstudio.errors import InputError
+from carstudio.files import write_json
 from carstudio.fitting.optimise import FitConfig
+from carstudio.images import write_png
 from carstudio.locks import FolderLock
 from carstudio.perception.specs import make_segmenter
 from carstudio.progress import Report
-from carstudio.scene.graph import Scene
+from carstudio.scene.edit_file import nearest
+from carstudio.scene.graph import CarRef, Scene
 from carstudio.scene.kitti import Log, open_det_log, open_mot_log
 from carstudio.scene.lifting import LiftConfig, lift_tracks
+from carstudio.scene.paint import parse_colour
+from carstudio.scene.recolour import CarPictures, PaintConfig, Way, pictures_of, recolour_car
+from carstudio.scene.recolour_measure import own_colour, recolour_truth, score_recolour, strip
 from carstudio.scene.scene_file import load_scene, save_scene
+from carstudio.scene.shelf import CarShelf
 from carstudio.scene.views import ViewConfig
 
 _SHOWN_PROBLEMS = 20
@@ -119,10 +127,69 @@ class Info(Output):
         return Outcome("\n".join(lines), {"out": str(self.scene), **counts(scene)})
 
 
+@dataclass(frozen=True, kw_only=True)
+class Recolour(Output):
+    """Show a track's car in another colour in all ways there are, and measure how well the colour follows."""
+
+    scene: tyro.conf.Positional[Path]
+    """Folder of the scene."""
+    track: str
+    """Whose car."""
+    colour: str
+    """'#rrggbb', or a name such as red."""
+    mix_with: str | None = None
+    """Another track, whose texture is mixed in; the ways are two without it."""
+    out: Path
+    """Folder to write: strip.png (the car, what was asked for, paint, paper, mix) and scores.json."""
+    side: int = 160
+    """Side of a picture in px."""
+
+    def run(self) -> Outcome:
+        """Recolour, compare, draw the strip."""
+        if not 16 <= self.side <= 1024:
+            raise InputError(f"--side must be 16 to 1024, found {self.side}")
+        scene = load_scene(self.scene)
+        refs = {name: track.car for name, track in scene.tracks.items() if track.car is not None}
+        for name in (self.track, self.mix_with):
+            if name is not None and name not in refs:
+                raise InputError(f"no car of a track {name!r}{nearest(name, refs, 'tracks with a car')}")
+        shelf = CarShelf(self.out)
+        taken = {name: shelf.take(CarShelf(self.scene).folder(ref.name), ref.name) for name, ref in refs.items()}
+        scores = self._compare(shelf, taken)
+        write_json(self.out / "scores.json", scores)
+        lines = [
+            f"  {way:<6} paint {each['paint_error']:.1f} (before {each['paint_error_before']:.1f}), rest "
+            f"{each['rest_error']:.1f}, shape {'the same to the bit' if each['is_same_shape'] else 'changed'}"
+            for way, each in scores.items()
+        ]
+        text = [f"{self.out / 'strip.png'}: mean CIEDE2000 to what was asked for", *lines]
+        return Outcome("\n".join(text), {"out": str(self.out), "scores": scores})
+
+    def _compare(self, shelf: CarShelf, refs: dict[str, CarRef]) -> dict[str, Any]:
+        ref, colour = refs[self.track], parse_colour(self.colour)
+        car, config = shelf.load(ref), PaintConfig(side_px=self.side)
+        model = shelf.model_of(car)
+        truth = recolour_truth(model, car, colour, config)
+        other = None if self.mix_with is None else refs[self.mix_with]
+        ways: list[Way] = ["paint", "paper"] if other is None else ["paint", "paper", "mix"]
+        pictures: list[CarPictures] = []
+        scores: dict[str, Any] = {}
+        for way in ways:
+            new = shelf.load(recolour_car(shelf, ref, way=way, colour=colour, other=other if way == "mix" else None))
+            pictures.append(pictures_of(model, new, config))
+            aim = truth
+            if other is not None and way == "mix":
+                aim = recolour_truth(model, car, own_colour(model, shelf.load(other), config), config)
+            scores[way] = asdict(score_recolour(aim, pictures[-1]))
+        write_png(self.out / "strip.png", strip(pictures, truth, config))
+        return scores
+
+
 Scenes = (
     Annotated[FromKittiMot, subcommand("from-kitti-mot")]
     | Annotated[FromKittiDet, subcommand("from-kitti-det")]
     | Annotated[Info, subcommand("info")]
+    | Annotated[Recolour, subcommand("recolour")]
     | Annotated[Replay, subcommand("replay")]
     | Annotated[Gap, subcommand("gap")]
 )

@@ -2,6 +2,7 @@
 
 - `instance`: no car on both sides (zero-shot).
 - `view`: the same cars, later views held out (multi-view, test-time optimisation).
+- by yaw (`dataset split --by yaw`): the same cars, seen from sides that do not train.
 - `released-patch`: the released code's split by patch in store order; the same car stands on both sides.
 
 Pictures that repeat each other (`duplicates.parquet`, where somebody has looked) are on one side of every split but the
@@ -11,7 +12,7 @@ released one.
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -36,6 +37,7 @@ class View:
     order: int
     sequence_id: str | None = None
     duplicates: int | None = None  # the group of pictures that it repeats or that repeat it
+    azimuth_rad: float | None = None  # from where around the car it was taken; None without a 3-D box
 
 
 Parts = dict[str, str]  # patch_id -> "train" | "test"
@@ -99,18 +101,47 @@ def split_by_view(views: Sequence[View], train_fraction: float = VIEW_TRAIN_FRAC
     return parts | {view.patch_id: "train" for view in views if view.duplicates in trained}
 
 
-SplitBy = Literal["instance", "view", "sequence", "patch"]
+def split_by_yaw(views: Sequence[View], train_fraction: float) -> Parts:
+    """Of each instance the views taken from nearest to where its first view was taken from train, the rest test.
+
+    So a model is asked for sides of the car that it was not shown. Views without a 3-D box train.
+    """
+    parts: Parts = {}
+    by_instance: dict[str, list[View]] = {}
+    for view in views:
+        by_instance.setdefault(view.instance_id, []).append(view)
+    for members in by_instance.values():
+        members.sort(key=lambda view: (view.order, view.patch_id))
+        turned = {view.patch_id: _turned(members, view) for view in members}
+        num_train = max(1, math.floor(train_fraction * len(members) + 1e-9))
+        ranked = sorted(members, key=lambda view: turned[view.patch_id])
+        parts |= {view.patch_id: "train" if rank < num_train else "test" for rank, view in enumerate(ranked)}
+    return parts
+
+
+def _turned(members: Sequence[View], view: View) -> float:
+    """How far around the car from its first view with a box, rad; 0 without a box."""
+    first = next((member.azimuth_rad for member in members if member.azimuth_rad is not None), None)
+    if first is None or view.azimuth_rad is None:
+        return 0.0
+    return abs(math.remainder(view.azimuth_rad - first, 2 * math.pi))
+
+
+SplitBy = Literal["instance", "view", "sequence", "patch", "yaw"]
 
 
 def make_split(views: Sequence[View], *, by: SplitBy, test_share: float = TEST_FRACTION, seed: int = 0) -> Parts:
     """A split of one's own: `test_share` of the cars, sequences or patches, or of each car's views (the last in time).
 
-    Seed 0 by instance is the standard split `instance`. By view there is nothing to draw: the seed changes nothing.
+    Seed 0 by instance is the standard split `instance`. By view or yaw there is nothing to draw: the seed changes
+    nothing.
     """
     if not 0 < test_share < 1:
         raise InputError(f"--test-share must be above 0 and below 1, found {test_share}")
     if by == "view":
         return split_by_view(views, 1 - test_share)
+    if by == "yaw":
+        return split_by_yaw(views, 1 - test_share)
     units = [{"instance": view.instance_id, "patch": view.patch_id}.get(by, view.sequence_id) for view in views]
     without = [view.patch_id for view, unit in zip(views, units, strict=True) if unit is None]
     if without:
@@ -155,6 +186,15 @@ def kept_views(store: "PatchStore") -> list[View]:
         View(patch_id, instance_id, rank if frame_index is None else frame_index, sequence_id, groups.get(patch_id))
         for rank, (patch_id, instance_id, frame_index, sequence_id) in enumerate(rows)
         if patch_id in kept
+    ]
+
+
+def seen_from(views: Sequence[View], azimuth_deg: Mapping[str, float]) -> list[View]:
+    """The views with their azimuths (by patch id, NaN where unknown, as `measure` gives them)."""
+    degrees = [azimuth_deg.get(view.patch_id, math.nan) for view in views]
+    return [
+        replace(view, azimuth_rad=None if math.isnan(angle) else math.radians(angle))
+        for view, angle in zip(views, degrees, strict=True)
     ]
 
 

@@ -4,6 +4,7 @@ YAML is read as plain values: no tags, no anchors (a few lines of them could ask
 """
 
 import difflib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import yaml
 from pydantic import TypeAdapter, ValidationError
 
 from carstudio.errors import InputError, shortened
-from carstudio.files import read_bounded
+from carstudio.files import read_bounded, write_text
 from carstudio.scene.edits import OPS, AnyEdit, Edit
 
 VERSION = 1
@@ -59,6 +60,16 @@ def parse_edits(text: str, *, name: str) -> list[Edit]:
     if not isinstance(entries, list):
         raise InputError(f"{name} line {lines.get(('edits',), 1)}: edits must be a list, found {shortened(entries)}")
     return [_edit(entry, index, lines, name) for index, entry in enumerate(entries)]
+
+
+def write_edits(path: Path, edits: Sequence[Edit]) -> None:
+    """An edit file (YAML) that says the same."""
+    entries = [edit.model_dump(exclude_none=True, mode="json") for edit in edits]
+    for entry in entries:
+        if "frames" in entry:
+            entry["frames"] = "{}-{}".format(*entry["frames"])
+    ordered = [{"op": entry.pop("op"), **entry} for entry in entries]
+    write_text(path, yaml.safe_dump({"version": VERSION, "edits": ordered}, sort_keys=False, allow_unicode=True))
 
 
 def _edit(entry: Any, index: int, lines: dict[Path_, int], name: str) -> Edit:

@@ -321,8 +321,3 @@ def colliding(scene: Scene, track: Track, index: int) -> list[str]:
     """Ids of the other tracks whose boxes a track's box overlaps in a frame."""
     others = ((name, other.boxes.get(index)) for name, other in sorted(scene.tracks.items()) if name != track.track_id)
     return [name for name, box in others if box is not None and collide(track.boxes[index], box)]
-
-
-def ego_box(frame: SceneFrame) -> PlacedBox:
-    """About where the car that carries the camera is, in that frame's camera frame (KITTI's: a Passat estate)."""
-    return box_standing(turn_y(-np.pi / 2), np.array([0.0, 1.65, -0.3]), (4.8, 1.6, 1.9))

@@ -18,8 +18,10 @@ _GAMMA = 2.2
 _AXLES, _WHEEL_X, _WHEEL_Y, _WHEEL_SIDE = (0.62, -0.6), 0.2, 0.5, 0.45
 _UNDERBODY = 0.82
 _GLASS = (-0.86, -0.08)  # between roof and belt line
-_CHROMATICITY, _LOG_LIGHT = 0.05, 0.7  # how far paint strays from its own colour
-_DARK_APART = 0.7  # log of lights: glass that differs less from the paint cannot be told from it
+_ENDS = 0.85  # lamps and grille
+# How far paint strays from its own colour: chromaticity, log of its light; on the body it may stray `_BODY` times that.
+_CHROMATICITY, _DARKER, _BRIGHTER, _BODY = 0.15, 0.8, 1.6, 2.5
+_DARK_APART = 1.0  # log of lights: glass that differs less from the paint cannot be told from it
 
 
 @dataclass(frozen=True)
@@ -35,15 +37,14 @@ def parse_colour(colour: str | tuple[float, float, float]) -> tuple[float, float
     """`#c01020`, `red`, or three numbers (0 to 1, or 0 to 255 where one is above 1) as sRGB in [0, 1]."""
     if isinstance(colour, str):
         try:
-            levels = ImageColor.getrgb(colour)
+            values = ImageColor.getrgb(colour)
         except ValueError as error:
             raise InputError(f"colour {colour!r}: expected '#rrggbb', a name such as red, or three numbers") from error
-        return levels[0] / 255, levels[1] / 255, levels[2] / 255
+        return values[0] / 255, values[1] / 255, values[2] / 255
     most = 255.0 if max(colour) > 1 else 1.0
-    if min(colour) < 0 or max(colour) > most:
+    if not (min(colour) >= 0 and max(colour) <= most):
         raise InputError(f"colour {colour}: expected three numbers of 0 to 1, or of 0 to 255")
-    red, green, blue = (value / most for value in colour)
-    return red, green, blue
+    return colour[0] / most, colour[1] / most, colour[2] / most
 
 
 def to_linear(rgb: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
@@ -81,34 +82,49 @@ def is_body(place: Float[Tensor, "pixel 3"]) -> Bool[Tensor, " pixel"]:
 
 
 def body_colour(view: PaintView) -> Float[Tensor, "3"]:
-    """The paint's colour in linear light: the median over the body. `InputError` when no body is seen."""
+    """The paint's colour in linear light: the mean of the body's brighter part, where neither dirt nor glints are.
+
+    `InputError` when no body is seen.
+    """
     body = view.is_car & is_body(view.place)
     if not bool(body.any()):
         raise InputError("the car's body is not to be seen in its own pictures; it cannot be painted")
-    return to_linear(view.rgb[body]).median(dim=0).values.clamp(min=1e-3)
+    linear = to_linear(view.rgb[body])
+    order = light_of(linear).argsort()
+    brighter = order[len(order) // 2 : max(len(order) * 9 // 10, len(order) // 2 + 1)]
+    return linear[brighter].mean(dim=0).clamp(min=1e-3)
 
 
 def paint_share(view: PaintView, paint: Float[Tensor, "3"]) -> Float[Tensor, " pixel"]:
-    """How much of each pixel is paint, 0 to 1."""
+    """How much of each pixel is paint, 0 to 1.
+
+    On the body nearly everything is; between roof and belt line and at the ends only what has the paint's colour.
+    """
     linear = to_linear(view.rgb)
-    glass, lamps = in_glass(view.place), view.place[:, 0].abs() > 0.82
-    strict = _likeness(linear, paint, 1.0)
-    share = torch.where(glass | lamps, strict, _likeness(linear, paint, 2.0))
+    glass, ends = in_glass(view.place), view.place[:, 0].abs() > _ENDS
+    share = torch.where(glass | ends, _likeness(linear, paint, 1.0), _likeness(linear, paint, _BODY))
     seen = view.is_car & glass
     if bool(seen.any()):
         apart = (light_of(linear[seen]).median().clamp(min=1e-3).log() - light_of(paint).log()).abs()
-        share = torch.where(glass & (apart < _DARK_APART), 0.0, share)
+        hue = (_chromaticity(linear[seen]).median(dim=0).values - _chromaticity(paint)).norm()
+        if float(apart) < _DARK_APART and float(hue) < _CHROMATICITY:
+            share = torch.where(glass, 0.0, share)
     out = in_wheel(view.place) | (view.place[:, 1] > _UNDERBODY) | ~view.is_car
     return torch.where(out, 0.0, share)
 
 
 def _likeness(linear: Float[Tensor, "pixel 3"], paint: Float[Tensor, "3"], wide: float) -> Float[Tensor, " pixel"]:
-    """Near 1 for pixels whose colour is the paint's under more or less light; little colour is left in the dark."""
+    """Near 1 for pixels whose colour is the paint's under more or less light; little colour is left in the dark.
+
+    Paint may be much brighter than itself in the shade (the sun), but hardly much darker.
+    """
     light, own = light_of(linear).clamp(min=1e-4), light_of(paint)
     hue = (_chromaticity(linear) - _chromaticity(paint)).norm(dim=-1)
     trust = (light / 0.02).clamp(max=1.0)
-    misses = (trust * hue / (wide * _CHROMATICITY)) ** 2 + ((light / own).log() / (wide * _LOG_LIGHT)) ** 2
-    return torch.exp(-(misses**2) / 2)
+    brighter = (light / own).log()
+    reach = torch.where(brighter > 0, _BRIGHTER, _DARKER)
+    misses = (trust * hue / (wide * _CHROMATICITY)) ** 2 + (brighter / (wide * reach)) ** 2
+    return torch.exp(-misses / 2)
 
 
 def _chromaticity(linear: Float[Tensor, "*shape 3"]) -> Float[Tensor, "*shape 3"]:

@@ -1,8 +1,8 @@
 """Another colour for a car, three ways. The shape code is never touched, so its shape stays as it is to the bit.
 
-`paper` (Car-Studio section V): a transparent colour over the photograph's car, of which only the texture code is taken.
-`mix`: a part of another car's texture code. `paint`: the car is rendered from all sides, its paint exchanged in these
-pictures (`paint`), and the texture code is fitted to them.
+`paper` (Car-Studio section V): a transparent colour over the photograph's car, of which only the texture code is
+taken. `mix`: a part of another car's texture code. `paint`: the car is rendered from all sides, its paint is exchanged
+in these pictures (`scene.paint`), and the texture code is fitted to them.
 """
 
 import hashlib

@@ -121,12 +121,9 @@ def _in_camera(spot: _Spot, axes: AxesName, frame: SceneFrame, around: Surroundi
         point, path_yaw = around.path.from_path(spot.x, down, spot.z)
         turn = turn_y(path_yaw + (spot.yaw_rad or 0.0))
     else:
-        height = _world_height(pose) if spot.y is None else spot.y
-        point = np.array([spot.x, height, spot.z])
-        yaw = spot.yaw_rad or 0.0
-        if spot.yaw_rad is None:
-            yaw = around.path.to_path(point)[1] if around.path is not None else 0.0
-        turn = turn_y(yaw)
+        point = np.array([spot.x, _world_height(pose) if spot.y is None else spot.y, spot.z])
+        along_road = around.path.to_path(point)[1] if spot.yaw_rad is None and around.path is not None else 0.0
+        turn = turn_y(along_road if spot.yaw_rad is None else spot.yaw_rad)
     return pose[:3, :3].T @ turn, pose[:3, :3].T @ (point - pose[:3, 3])
 
 

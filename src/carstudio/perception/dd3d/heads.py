@@ -60,7 +60,7 @@ class Scales(nn.ModuleList):
     """A learned factor per level."""
 
     def __init__(self, values: Sequence[float]) -> None:
-        super().__init__(Scale(float(value)) for value in values)
+        super().__init__(Scale(value) for value in values)
 
     def of_level(self, level: int) -> Float[Tensor, "1"]:
         """The level's factor."""
@@ -123,7 +123,7 @@ class FCOS2DHead(nn.Module):
         self.cls_logits = predictor(num_classes)
         self.box2d_reg = predictor(4)
         self.centerness = predictor(1)
-        self.scales_box2d_reg = Scales(strides)
+        self.scales_box2d_reg = Scales([float(stride) for stride in strides])
 
 
 class FCOS3DHead(nn.Module):
@@ -142,7 +142,7 @@ class FCOS3DHead(nn.Module):
         self.box3d_depth = nn.ModuleList([predictor(num_classes, bias=False)])
         self.box3d_size = nn.ModuleList([predictor(3 * num_classes)])
         self.box3d_conf = nn.ModuleList([predictor(num_classes)])
-        self.scales_proj_ctr = Scales(strides)
+        self.scales_proj_ctr = Scales([float(stride) for stride in strides])
         self.scales_size = Scales([1.0] * NUM_LEVELS)
         self.scales_conf = Scales([1.0] * NUM_LEVELS)
         self.scales_depth = Scales([0.3 * std for std in DEPTH_STD])
