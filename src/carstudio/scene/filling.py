@@ -7,7 +7,7 @@ known: so wrong poses, depths and moving things cost a worse fill, not a wrong o
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -31,6 +31,7 @@ _INPAINT_RADIUS_PX = 4
 Photograph = UInt8[np.ndarray, "height width 3"]
 
 
+@runtime_checkable
 class Inpainter(Protocol):
     """Makes up pixels from their surroundings; the place for a learned one."""
 

@@ -33,8 +33,7 @@ class Ground:
 
     def height_of(self, points: Float[np.ndarray, "*shape 3"]) -> Float[np.ndarray, "*shape"]:
         """Metres above the plane; negative below it."""
-        height: Float[np.ndarray, "*shape"] = self.height_m - points @ np.array(self.normal)
-        return height
+        return np.asarray(self.height_m - points @ np.array(self.normal))
 
     def depth(self, camera: Camera, *, lower_m: float = 0.0) -> Float[np.ndarray, "height width"]:
         """Depth (camera z, m) at which pixels' rays meet the plane, moved down by `lower_m`; inf above the horizon."""

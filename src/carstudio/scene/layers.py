@@ -15,9 +15,10 @@ from torch import Tensor
 from carstudio.geometry.box3d import Box3D
 from carstudio.geometry.camera import Camera
 from carstudio.models.interface import CategoryModel, Latents, tiles_that_hit, window_of
-from carstudio.rendering.rays import Rays, image_rays, to_canonical
+from carstudio.rendering.rays import image_positions, image_rays, pixel_rays, to_canonical
 from carstudio.rendering.volume import Segments, weights_from_alpha
 
+RIM_SAMPLES = 6  # per side, of a pixel at the rim of a box
 FAINTEST = 1 / 512  # a share of a pixel that moves no 8-bit value by more than half a step
 
 
@@ -46,24 +47,69 @@ class ObjectLayer:
 
 @torch.no_grad()
 def trace_object(model: CategoryModel, latents: Latents, box: Box3D, camera: Camera) -> TracedObject:
-    """The segments of a car on all pixels whose rays hit its box (a batch of one)."""
+    """The segments of a car on all pixels that its box (a batch of one) covers, if only in part.
+
+    A model knows nothing outside its box, so there the car is cut off, and hard if rays went through pixels' centres
+    alone. A pixel at the box's rim is looked at where the box covers it, and its segments count for that share of it.
+    """
     x, y, width, height = window_of(box, camera)
     if width == 0 or height == 0:
         return _nothing(camera)
-    rays = image_rays(camera.crop(x, y, width, height))
-    hit = to_canonical(rays, box).hit[0]
-    tiles = tiles_that_hit(hit.view(height, width), model.tile_px)
+    seen = camera.crop(x, y, width, height)
+    wide_positions, wide_share = _coverage(box, seen.crop(-1, -1, width + 2, height + 2))  # the rim needs neighbours
+    inner = torch.zeros(height + 2, width + 2, dtype=torch.bool)
+    inner[1:-1, 1:-1] = True
+    positions, share = wide_positions[inner.flatten()] - 1, wide_share[inner.flatten()]
+    tiles = tiles_that_hit((share > 0).view(height, width), model.tile_px)
     if len(tiles) == 0:
         return _nothing(camera)
+    rays = pixel_rays(_one(seen), positions[None])
     parts = [model.trace(rays.select(rows), latents, box) for rows in tiles.split(model.chunk_rays)]
     segments = _joined(parts)
-    # Tiles at the window's edge repeat pixels and hold some that miss the box: each hit pixel once.
+    # Tiles at the window's edge repeat pixels and hold some that miss the box: each covered pixel once.
     first = torch.full((width * height,), -1, dtype=torch.long)
     first[tiles] = torch.arange(len(tiles))
-    rows = first[hit & (first >= 0)]
+    rows = first[(share > 0) & (first >= 0)]
     pixel = tiles[rows]
     numbers = (pixel // width + y) * camera.width + pixel % width + x
-    return TracedObject(numbers, select_rays(segments, rows))
+    return TracedObject(numbers, partial_segments(select_rays(segments, rows), share[pixel]))
+
+
+def _one(camera: Camera) -> Camera:
+    return Camera(camera.intrinsics[None], camera.width, camera.height)
+
+
+def _coverage(box: Box3D, camera: Camera) -> tuple[Float[Tensor, "pixel 2"], Float[Tensor, " pixel"]]:
+    """Share of each pixel that the box covers, and the middle (px) of that part; the pixel's centre where it is none.
+
+    Only pixels at the rim, next to ones whose centre is covered or not, are looked at closely.
+    """
+    positions = image_positions(camera.width, camera.height, camera.intrinsics)
+    hit = to_canonical(image_rays(camera), box).hit[0]
+    share = hit.to(positions.dtype)
+    near = torch.nn.functional.max_pool2d(share.view(1, 1, camera.height, camera.width), 3, 1, 1)
+    far = -torch.nn.functional.max_pool2d(-share.view(1, 1, camera.height, camera.width), 3, 1, 1)
+    rim = (near != far).flatten().nonzero()[:, 0]
+    if len(rim):
+        fine = image_positions(RIM_SAMPLES, RIM_SAMPLES, positions) / RIM_SAMPLES - 0.5
+        samples = positions[rim, None] + fine
+        inside = to_canonical(pixel_rays(_one(camera), samples.flatten(0, 1)[None]), box).hit[0].view(len(rim), -1, 1)
+        count = inside.sum(dim=1)
+        share[rim] = count[:, 0] / len(fine)
+        middle = (samples * inside).sum(dim=1) / count.clamp(min=1)
+        positions[rim] = torch.where(count > 0, middle, positions[rim])
+    return positions, share
+
+
+def partial_segments(segments: Segments, share: Float[Tensor, " ray"]) -> Segments:
+    """Segments that fill only a share of their pixel: every weight times the share, written as alphas again."""
+    rim = (share < 1).nonzero()[:, 0]
+    if len(rim) == 0:
+        return segments
+    weights = weights_from_alpha(segments.alpha[:, rim]) * share[rim, None]
+    left = 1 - (weights.cumsum(dim=-1) - weights)
+    alpha = segments.alpha.index_copy(1, rim, (weights / left.clamp(min=1e-6)).clamp(max=1))
+    return Segments(segments.distance_m, segments.depth_m, alpha, segments.rgb)
 
 
 def _nothing(camera: Camera) -> TracedObject:
@@ -174,5 +220,4 @@ def bands(camera: Camera, rows: int) -> list[tuple[int, Camera]]:
 
 def ray_lengths(camera: Camera) -> Float[Tensor, " pixel"]:
     """Distance along the ray per metre of depth, for each pixel."""
-    rays: Rays = image_rays(camera)
-    return 1 / rays.directions[0, :, 2]
+    return 1 / image_rays(camera).directions[0, :, 2]

@@ -36,17 +36,20 @@ def blur_of(image: Photograph) -> float:
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
     again = cv2.GaussianBlur(grey, (0, 0), _REBLUR_PX)
     first, second = _gradient(grey), _gradient(again)
-    strong = first > max(20.0, float(np.percentile(first, 98)))
+    strong = first > max(8.0, float(np.percentile(first, 98)))
     if strong.sum() < _LEAST_PIXELS:
         return 0.0
     ratio = first[strong] / np.maximum(second[strong], 1e-6)
     sharp = float(np.quantile(ratio, 1 - _SHARPEST))
-    return _REBLUR_PX / max(sharp * sharp - 1, 1e-6) ** 0.5
+    variance = _REBLUR_PX**2 / max(sharp * sharp - 1, 1e-6)
+    return max(0.0, variance - 1 / 12) ** 0.5  # the difference of two pixels is itself a mean over one
 
 
 def _gradient(grey: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width"]:
-    dx, dy = np.gradient(grey, axis=1), np.gradient(grey, axis=0)
-    return np.hypot(dx, dy)
+    """The larger of the differences to the pixels to the right and below."""
+    dx = np.abs(np.diff(grey, axis=1, append=grey[:, -1:]))
+    dy = np.abs(np.diff(grey, axis=0, append=grey[-1:]))
+    return np.maximum(dx, dy)
 
 
 def noise_of(image: Photograph) -> float:
