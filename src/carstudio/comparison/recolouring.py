@@ -21,11 +21,12 @@ import torch
 
 from carstudio.dataset.patch import MaskValue
 from carstudio.dataset.pixels import PreparedPatch, prepare_patch
-from carstudio.dataset.sources.synthetic import SynthConfig, car_records, make_car
+from carstudio.dataset.sources.synthetic import SynthConfig, car_records
 from carstudio.evaluation.metrics import score_image
 from carstudio.files import parse_json, write_text
 from carstudio.models.interface import CategoryModel, Latents, render_image
 from carstudio.progress import Report, silent
+from carstudio.synthetic.cars import paint_of
 from carstudio.synthetic.materials import Paint
 from carstudio.training.batches import patch_batch, stack_boxes
 
@@ -72,9 +73,7 @@ def draw_recolourings(count: int, *, size_px: int, side_px: int, report: Report 
 
 
 def _paint(config: SynthConfig, index: int) -> Paint:
-    paint = make_car(config, [], index).paint
-    assert paint is not None, "drawn cars have a paint"
-    return paint
+    return paint_of(np.random.default_rng([config.seed, index]))
 
 
 def _difference(config: SynthConfig, index: int, other: int) -> float:

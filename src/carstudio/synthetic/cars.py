@@ -35,3 +35,9 @@ def draw_car(rng: np.random.Generator, repaint: Paint | None = None) -> Car:
     """
     style, paint = draw_style(rng), draw_paint(rng)
     return build_car(style, repaint or paint, rng)
+
+
+def paint_of(rng: np.random.Generator) -> Paint:
+    """The paint that `draw_car` gives the car of this generator state; nothing is built."""
+    draw_style(rng)
+    return draw_paint(rng)
