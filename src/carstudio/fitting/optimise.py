@@ -241,8 +241,9 @@ def _descend(
 
 def field_parameters(model: CategoryModel) -> list[tuple[str, torch.nn.Parameter]]:
     """The parameters that act after encoding: all but those of the encoder and of the heads that make its codes."""
-    encoding = ("encoder.", "shape_head.", "texture_head.", "shape_norm.", "texture_norm.", "colour_skip.")
-    encoding += ("shape_codes", "texture_codes")  # of the cars that were trained on
+    heads = ("shape_head.", "texture_head.", "shape_norm.", "texture_norm.", "colour_skip.")
+    codes = ("shape_codes", "texture_codes")  # of the cars that were trained on
+    encoding = ("encoder.", *heads, *codes)
     return [(name, p) for name, p in model.named_parameters() if not name.startswith(encoding)]
 
 
