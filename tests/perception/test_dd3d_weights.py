@@ -218,3 +218,18 @@ def test_the_whole_way_from_checkpoint_to_store(tmp_path: Path, capsys: pytest.C
     score_2d = math.sqrt(1 / (1 + math.exp(-6.0)) / (1 + math.exp(-5.0)))
     assert (joined.score_2d, joined.score_3d) == (0.8, pytest.approx(score_2d / (1 + math.exp(-2.0)), rel=1e-5))
     open_dd3d.cache_clear()
+
+
+def test_it_could_be_trained() -> None:
+    """Raw outputs are there before decoding, and gradients reach every parameter."""
+    torch.manual_seed(0)
+    network = DD3D(DD3DConfig("dla34")).train()
+    outputs = network(torch.randn(2, 3, 128, 128))
+    loss = torch.stack([getattr(level, name).square().mean() for level in outputs for name in vars(level)]).sum()
+    loss.backward()
+    for name, parameter in network.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+    moving = network.get_buffer("fcos2d_head.cls_tower.0.norm.0.running_mean")
+    frozen = network.get_buffer("fcos3d_head.box3d_tower.0.norm.0.running_mean")
+    assert float(moving.abs().max()) > 0 == float(frozen.abs().max())
