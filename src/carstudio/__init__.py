@@ -10,10 +10,11 @@ _HOMES = {
     "Camera": "carstudio.geometry.camera",
     "Box3D": "carstudio.geometry.box3d",
     "InputError": "carstudio.errors",
+    "Scene": "carstudio.scene.graph",
     "load_model": "carstudio.training.checkpoint",
     "open_store": "carstudio.dataset.store",
 }
-__all__ = ["Box3D", "Camera", "InputError", "load_model", "open_store"]
+__all__ = ["Box3D", "Camera", "InputError", "Scene", "load_model", "open_store"]
 
 
 def __getattr__(name: str) -> Any:

@@ -9,6 +9,7 @@ from carstudio.models.car_gaussians import CarGaussiansConfig
 from carstudio.models.car_nerf import CarNeRFConfig
 from carstudio.models.code_nerf import CodeNeRFConfig
 from carstudio.models.encoders import EncoderConfig
+from carstudio.models.nsg import NSGConfig
 from carstudio.models.pixel_nerf import PixelNeRFConfig
 from carstudio.rendering.field import SamplingConfig
 from carstudio.rendering.gaussians.tracing import SplattingConfig
@@ -137,6 +138,23 @@ def code_nerf() -> TrainConfig:
     )
 
 
+def nsg() -> TrainConfig:
+    """NSG's object model with the original's knobs: 7 samples, a box 1.9 times as long and wide, the place known."""
+    return replace(
+        car_nerf(),
+        recipe="nsg",
+        model=NSGConfig(),
+        schedule=ScheduleConfig(first=5e-4, last=5e-5, decay_steps=250_000),
+        optimizer="adam",
+    )
+
+
+def nsg_fair() -> TrainConfig:
+    """NSG's object model with 64 samples a ray and without the place."""
+    model = NSGConfig(sampling=SamplingConfig(coarse=64, fine=0), sees_place=False)
+    return replace(nsg(), recipe="nsg-fair", model=model)
+
+
 RECIPES: dict[str, Callable[[], TrainConfig]] = {
     "car-nerf": car_nerf,
     "car-nerf-no-mask": car_nerf_no_mask,
@@ -150,6 +168,8 @@ RECIPES: dict[str, Callable[[], TrainConfig]] = {
     "autorf": autorf,
     "autorf-occupancy": autorf_occupancy,
     "code-nerf": code_nerf,
+    "nsg": nsg,
+    "nsg-fair": nsg_fair,
 }
 
 

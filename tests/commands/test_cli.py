@@ -40,7 +40,10 @@ ACTIONS = ("info", "verify", "refilter", "merge", "split", "duplicates", "export
 
 
 @pytest.mark.parametrize(
-    "words", [[verb] for verb in VERBS if verb != "dataset"] + [["dataset", action] for action in ACTIONS]
+    "words",
+    [[verb] for verb in VERBS if verb not in ("dataset", "scene")]
+    + [["dataset", action] for action in ACTIONS]
+    + [["scene", action] for action in ("from-kitti-mot", "from-kitti-det", "info", "recolour")],
 )
 def test_every_verb_explains_itself(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:

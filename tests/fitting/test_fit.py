@@ -14,7 +14,7 @@ from carstudio.dataset.store import PatchStore
 from carstudio.errors import InputError
 from carstudio.fitting.boxes import BoxFreedom
 from carstudio.fitting.car_file import load_car
-from carstudio.fitting.optimise import FitConfig, Fitted, field_parameters
+from carstudio.fitting.optimise import FitConfig, Fitted
 from carstudio.models.interface import CategoryModel
 from carstudio.training.batches import patch_batch
 from carstudio.training.checkpoint import load_model
@@ -76,7 +76,7 @@ def test_the_field_is_fitted_in_a_copy_and_does_more(store: PatchStore, trained:
     both = fit_named(model, store, [name], FitConfig(steps=30, field_rate=5e-3), looks=True)
     assert min(v for _, v in both.curve) < min(v for _, v in latents.curve)
     assert all(torch.equal(value, before[key]) for key, value in model.state_dict().items())
-    assert both.weights.keys() == {key for key, _ in field_parameters(model)}
+    assert both.weights.keys() == {key for key, _ in model.field_parameters()}
     assert not any(key.startswith("encoder.") for key in both.weights)
 
 

@@ -18,19 +18,18 @@ from carstudio.perception.dd3d.decoding import (
     candidates,
     egocentric_from_allocentric,
     metric_depth,
+    place_in_space,
 )
 from carstudio.perception.dd3d.heads import HeadOutputs
 from carstudio.perception.dd3d.kitti import result_text
 from carstudio.perception.dd3d.model import KITTI_CLASSES
 from carstudio.perception.results import Photo
 from oracles import dd3d_slow as slow
+from perception.dd3d_encoding import CHANNELS, Said, say, silent_outputs
 
 CANONICAL = torch.tensor(list(KITTI_CLASSES.values()))
 CAMERA = (700.0, 650.0, 90.0, 60.0)
 STRIDES, GRIDS = (8, 16), ((7, 11), (4, 6))
-CHANNELS = {
-    "logits": 5, "centerness": 1, "box2d": 4, "quaternion": 20, "center": 10, "depth": 5, "size": 15, "confidence": 5,
-}  # fmt: skip
 
 
 def made_up(photos: int, seed: int = 0) -> list[HeadOutputs]:
@@ -102,29 +101,21 @@ def test_depth_is_that_of_equal_size_in_the_image() -> None:
     torch.testing.assert_close(metric_depth(raw, doubled), 2 * metric_depth(raw, single))
 
 
-def encoded(yaw: float, center: np.ndarray, size: tuple[float, float, float], kind: int) -> list[HeadOutputs]:
-    """One cell that says this car, all others nothing; by the oracle's angles, not by ours."""
-    outputs = made_up(1)
-    for level in outputs:
-        level.logits.fill_(-20.0)
-    fx, fy, cx, cy = CAMERA
-    u, v = fx * center[0] / center[2] + cx, fy * center[1] / center[2] + cy
-    cell, row, column = outputs[0], 3, 5
-    allocentric = slow.pointed_at(center).T @ slow.kitti_object_rotation(yaw)
-    length, height, width = size
-    values = {
-        "quaternion": 3.7 * slow.quaternion_of(allocentric),
-        "center": [u - column * 8, v - row * 8],
-        "depth": [center[2] * 500 * math.hypot(1 / fx, 1 / fy)],
-        "size": [math.atanh(a / b - 1) for a, b in zip((width, length, height), CANONICAL[kind].tolist(), strict=True)],
-        "confidence": [20.0],
-    }
-    for name, components in values.items():
-        for c, value in enumerate(components):
-            getattr(cell, name)[0, c * 5 + kind, row, column] = float(value)
-    cell.logits[0, kind, row, column] = 20.0
-    cell.centerness[0, 0, row, column] = 20.0
-    cell.box2d[0, :, row, column] = torch.tensor([20.0, 10.0, 24.0, 14.0])
+def test_a_wrong_focal_length_moves_a_box_in_depth_alone() -> None:
+    """(u - cx) / f grows as much less as z grows more: x and y stay (what `bench/focal_error.py` finds on labels)."""
+    truth = torch.tensor([[-3.0, 1.1, 14.0], [2.0, 0.6, 33.0]], dtype=torch.float64)
+    own = Camera(torch.tensor(CAMERA, dtype=torch.float64), 88, 64)
+    raw = truth[:, 2] * 500 * math.hypot(1 / CAMERA[0], 1 / CAMERA[1])
+    for factor in (0.7, 1.0, 1.3):
+        wrong = Camera(own.intrinsics * torch.tensor([factor, factor, 1.0, 1.0]), 88, 64)
+        _, center = place_in_space(torch.eye(4)[:2].double(), raw, own.project(truth), wrong)
+        np.testing.assert_allclose(center, truth * torch.tensor([1.0, 1.0, factor]), rtol=1e-6)
+
+
+def encoded(rotation: np.ndarray, center: np.ndarray, size: tuple[float, float, float], kind: int) -> list[HeadOutputs]:
+    """One cell says this box, the others say nothing."""
+    outputs = [silent_outputs(*grid) for grid in GRIDS]
+    say(outputs[0], 8, CAMERA, Said(kind, rotation, center, size, (20.0, 14.0, 64.0, 38.0)), (3, 5))
     return outputs
 
 
@@ -132,7 +123,9 @@ def encoded(yaw: float, center: np.ndarray, size: tuple[float, float, float], ki
 def test_an_encoded_label_is_found_again(yaw: float) -> None:
     """The whole way to our axes; and KITTI's text of it, read by our own reader."""
     center, size = np.array([-2.0, 0.7, 17.0]), (4.1, 1.6, 1.7)
-    (found,) = candidates(encoded(yaw, center, size, 0), STRIDES, batch_camera(1), CANONICAL, Selection())
+    (found,) = candidates(
+        encoded(slow.kitti_object_rotation(yaw), center, size, 0), STRIDES, batch_camera(1), CANONICAL, Selection()
+    )
     assert len(found) == 1
     photo = photo_of(176, 64, camera_offset=(0.06, 0.0, 0.003))
     (box,) = to_photo(found, Camera(torch.tensor(CAMERA), 88, 64), photo)
@@ -153,9 +146,17 @@ def test_an_encoded_label_is_found_again(yaw: float) -> None:
 def test_people_are_no_vehicles_and_boxes_end_with_the_photo() -> None:
     center, size = np.array([0.0, 0.0, 9.0]), (0.9, 1.8, 0.6)
     seen = Camera(torch.tensor(CAMERA), 88, 64)
-    (found,) = candidates(encoded(0.3, center, size, 1), STRIDES, batch_camera(1), CANONICAL, Selection())
+    (found,) = candidates(
+        encoded(slow.kitti_object_rotation(0.3), center, size, 1), STRIDES, batch_camera(1), CANONICAL, Selection()
+    )
     assert to_photo(found, seen, photo_of(88, 64)) == []
-    (found,) = candidates(encoded(0.3, center, (4.0, 1.5, 1.6), 0), STRIDES, batch_camera(1), CANONICAL, Selection())
+    (found,) = candidates(
+        encoded(slow.kitti_object_rotation(0.3), center, (4.0, 1.5, 1.6), 0),
+        STRIDES,
+        batch_camera(1),
+        CANONICAL,
+        Selection(),
+    )
     shifted = Detections(**{**vars(found), "box2d": torch.tensor([[-5.0, 10.0, 400.0, 30.0]])})
     (box,) = to_photo(shifted, seen, photo_of(88, 64))
     assert box.box2d == (0.0, 10.0, 88.0, 30.0)
@@ -165,11 +166,10 @@ def test_people_are_no_vehicles_and_boxes_end_with_the_photo() -> None:
 
 def test_a_leaning_box_keeps_its_rotation() -> None:
     center = np.array([1.0, 0.5, 8.0])
-    outputs = encoded(0.2, center, (4.0, 1.5, 1.6), 0)
     leaning = slow.turn(0, 0.2) @ slow.kitti_object_rotation(0.2)  # a camera that looks down
-    for c, value in enumerate(slow.quaternion_of(slow.pointed_at(center).T @ leaning)):
-        outputs[0].quaternion[0, c * 5, 3, 5] = float(value)
-    (found,) = candidates(outputs, STRIDES, batch_camera(1), CANONICAL, Selection())
+    (found,) = candidates(
+        encoded(leaning, center, (4.0, 1.5, 1.6), 0), STRIDES, batch_camera(1), CANONICAL, Selection()
+    )
     (box,) = to_photo(found, Camera(torch.tensor(CAMERA), 88, 64), photo_of(88, 64))
     assert box.rotation is not None
     axes = slow.matrix_of(np.array(box.rotation))

@@ -58,11 +58,14 @@ def test_it_equals_the_original(dd3d_data: Path, backbone: Backbone) -> None:
     reference = real_reference(dd3d_data, backbone)
     check_input(network, reference)
     check_features_and_boxes(network, reference, factor=1)
-    singles = check_second_input(network)
+    plain = check_second_input(network)
     network.fuse()
     check_features_and_boxes(network, reference, factor=10)
-    for fused, plain in zip(check_second_input(network), singles, strict=True):
-        assert_same_choices(fused, plain)
+    (fused,) = network.detect(*([part] for part in synthetic_input()))
+    assert sorted(choices(fused)) == sorted(choices(plain))
+    np.testing.assert_allclose(fused.score_3d, plain.score_3d, atol=7e-4)
+    if backbone == "dla34":
+        check_low_precision(network)
 
 
 def check_input(network: DD3D, reference: Reference) -> None:
@@ -185,35 +188,47 @@ def _pairs(text: str) -> list[tuple[int, int]]:
     return [(1 if y == "+" else -1, 1 if z == "+" else -1) for y, z in text.split()]
 
 
-def check_second_input(network: DD3D) -> list[Detections]:
+def check_second_input(network: DD3D) -> Detections:
     """Another size, another camera: sound outputs, and two photos together as each alone."""
     image, camera = synthetic_input()
-    other = image.flip(-1)
-    pixels = network.prepare([image, other])
-    assert pixels.shape == (2, 3, 128, 256)  # no padding
-    together = network(pixels)
-    for photo, picture in enumerate((image, other)):
-        for stride, alone, both in zip(
-            network.backbone.strides, network(network.prepare([picture])), together, strict=True
-        ):
-            assert alone.logits.shape == (1, 5, 128 // stride, 256 // stride)
-            for theirs, (ours, tolerance) in RAW.items():
-                one, two = getattr(alone, ours)[0], getattr(both, ours)[photo]
-                assert one.isfinite().all()
-                np.testing.assert_allclose(one, two, atol=tolerance, rtol=0, err_msg=theirs)
-    pairs = network.detect([image, other], [camera, camera.flip()])
-    singles = [network.detect([image], [camera])[0], network.detect([other], [camera.flip()])[0]]
-    for one, two in zip(singles, pairs, strict=True):
-        assert_same_choices(one, two)
-        assert len(one) == 100  # what the reference's notes say of this input
-        assert all(getattr(one, field.name).isfinite().all() for field in fields(one))
-        assert float(one.center[:, 2].min()) >= 0.1 - 1e-6
-    return singles
+    images, cameras = [image, image.flip(-1)], [camera, camera.flip()]
+    assert network.prepare(images).shape == (2, 3, 128, 256)  # no padding
+    together = network(network.prepare(images))
+    alone = network(network.prepare([image]))
+    for stride, one, both in zip(network.backbone.strides, alone, together, strict=True):
+        assert one.logits.shape == (1, 5, 128 // stride, 256 // stride)
+        for theirs, (ours, tolerance) in RAW.items():
+            value = getattr(one, ours)[0]
+            assert value.isfinite().all()
+            np.testing.assert_allclose(value, getattr(both, ours)[0], atol=tolerance, rtol=0, err_msg=theirs)
+    (found,), both = boxes_of(network, alone, [camera]), boxes_of(network, together, cameras)
+    assert choices(found) == choices(both[0]) != choices(both[1])
+    for boxes in (found, *both):
+        assert len(boxes) == 100  # what the reference's notes say of this input
+        assert all(getattr(boxes, field.name).isfinite().all() for field in fields(boxes))
+        assert float(boxes.center[:, 2].min()) >= 0.1 - 1e-6
+    return found
 
 
-def assert_same_choices(one: Detections, two: Detections) -> None:
-    for ours in CHOICES.values():
-        np.testing.assert_array_equal(getattr(one, ours), getattr(two, ours))
+def check_low_precision(network: DD3D) -> None:
+    """bfloat16 rounds to 8 bits at each of dozens of layers; random weights make the most of that."""
+    pixels = network.prepare([synthetic_input()[0]])
+    exact, rough = network(pixels), network.set_precision(torch.bfloat16)(pixels)
+    for field in fields(HeadOutputs):
+        one, two = (getattr(outputs[0], field.name).flatten() for outputs in (exact, rough))
+        assert two.dtype == torch.float32
+        assert float(torch.corrcoef(torch.stack([one, two]))[0, 1]) > 0.9, field.name
+
+
+def boxes_of(network: DD3D, outputs: list[HeadOutputs], cameras: list[Camera]) -> list[Detections]:
+    camera = Camera(torch.stack([camera.intrinsics for camera in cameras]), 256, 128)
+    found = candidates(outputs, network.backbone.strides, camera, network.canonical_sizes, network.config.selection)
+    return [settled(boxes, network.config.suppression) for boxes in found]
+
+
+def choices(found: Detections) -> list[tuple[int, int, int]]:
+    """Level, cell and class of each box, in order."""
+    return list(zip(found.level.tolist(), found.cell.tolist(), found.kind.tolist(), strict=True))
 
 
 def test_the_photo_is_resized_as_the_original_does(dd3d_data: Path, test_data: Path) -> None:

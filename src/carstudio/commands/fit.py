@@ -60,6 +60,8 @@ class Fit(Output):
                 f"--rays and --cars-per-batch must be at least 1, found {self.rays} and {self.cars_per_batch}"
             )
         model, store = load_model(self.model, device=pick_device(self.device)), open_store(self.data)
+        if not model.is_coded:
+            raise InputError(f"{self.model}: looks cars up in their photos and has no codes to keep in a file")
         split = split_of(self.split)
         names = instances_of(store, split) if self.instance == (ALL,) else list(self.instance)
         photos = {name: photographs_of(store, name, split) for name in names}

@@ -20,7 +20,7 @@ from carstudio.progress import Report
 from carstudio.scene.edit_file import nearest
 from carstudio.scene.graph import CarRef, Scene
 from carstudio.scene.kitti import Log, open_det_log, open_mot_log
-from carstudio.scene.lifting import LiftConfig, lift_tracks
+from carstudio.scene.lifting import SCENE_FIT, LiftConfig, lift_tracks
 from carstudio.scene.paint import parse_colour
 from carstudio.scene.recolour import CarPictures, PaintConfig, Way, pictures_of, recolour_car
 from carstudio.scene.recolour_measure import own_colour, recolour_truth, score_recolour, strip
@@ -49,8 +49,10 @@ class MakeScene(Output):
     """Label types that become cars to edit; others stay as the photographs show them."""
     views: tyro.conf.OmitArgPrefixes[ViewConfig] = field(default_factory=ViewConfig)
     """Which photographs of a car are taken."""
-    fit: tyro.conf.OmitArgPrefixes[FitConfig] = field(default_factory=FitConfig)
+    fit: tyro.conf.OmitArgPrefixes[FitConfig] = SCENE_FIT
     """How a car is fitted to them."""
+    no_mirrors: bool = False
+    """Do not take photographs flipped left to right for the side that no photograph shows."""
     rays: int = 256
     """Pixels per photograph and step."""
     seed: int = 0
@@ -70,7 +72,13 @@ class MakeScene(Output):
         """Read the log, lift its cars, write the scene."""
         device, segmenter = pick_device(self.device), make_segmenter(self.segmenter)
         config = LiftConfig(
-            model=self.model, types=self.types, views=self.views, fit=self.fit, rays=self.rays, seed=self.seed
+            model=self.model,
+            types=self.types,
+            views=self.views,
+            fit=self.fit,
+            mirrors=not self.no_mirrors,
+            rays=self.rays,
+            seed=self.seed,
         )
         with FolderLock(self.out), self.progress() as report:
             log = self.open_log(report)

@@ -7,14 +7,16 @@ from typing import Annotated, Literal
 import tyro
 
 from carstudio.commands.command import Outcome, Output, plain, provenance
-from carstudio.comparison.budgets import BUDGETS, BudgetName
+from carstudio.comparison.budgets import BUDGETS, Budget, BudgetName
+from carstudio.comparison.learning_curves import fitted_rows, make_learning_curves, scratch_rows
 from carstudio.comparison.rows import ROWS, SPLITS, chosen
 from carstudio.comparison.running import Work
+from carstudio.comparison.scaling import make_scaling, scaling_rows
 from carstudio.comparison.table import make_table
 from carstudio.dataset.sources.synthetic import SynthConfig, synthesize
 from carstudio.dataset.store import PatchStore, open_store
 from carstudio.errors import InputError
-from carstudio.evaluation.tables import to_markdown
+from carstudio.evaluation.tables import Table, to_markdown
 from carstudio.files import require_writable
 from carstudio.progress import Report
 from carstudio.signals import held_back_stops
@@ -29,11 +31,15 @@ class MakeTable(Output):
     Started again with the same options it goes on, row by row.
     """
 
-    name: tyro.conf.Positional[Literal["zero-shot", "multi-view", "scaling"]]
-    """zero-shot (the paper's Table II), multi-view (its Table III) or scaling (number of cars, recolouring,
-    smaller images)."""
+    name: tyro.conf.Positional[Literal["zero-shot", "multi-view", "scaling", "ttopt"]]
+    """zero-shot (the paper's Table II), multi-view (its Table III), scaling (number of cars, recolouring, smaller
+    images) or ttopt (its learning curve of test-time optimisation, beside NSG's object model)."""
     data: Path | None = None
     """The CarPatch3D store; without it (smoke only) a tiny synthetic one is made in OUT/cars."""
+    fit_data: Path | None = None
+    """ttopt: the store whose cars are fitted (the paper: KITTI-MOT, trained on KITTI-DET); --data when absent."""
+    fit_split: str = "view"
+    """ttopt: split of --fit-data by view, or one of `dataset split --by yaw`: its training part is fitted."""
     out: Path
     """Folder of the table and its runs."""
     budget: BudgetName = "cpu"
@@ -70,7 +76,8 @@ class MakeTable(Output):
                 raise InputError("--steps does not go with --budget cpu: its rows share processor seconds")
             budget = replace(budget, steps=self.steps)
         budget = replace(budget, scored=self.limit if self.limit is not None else budget.scored)
-        rows = chosen(ROWS[self.name](), self.rows)
+        if self.fit_data is not None and self.name != "ttopt":
+            raise InputError(f"--fit-data goes with `table ttopt`, found `table {self.name}`")
         require_writable(self.out / "rows.jsonl")
         with self.progress() as report, held_back_stops() as stops:
             work = Work(
@@ -85,10 +92,19 @@ class MakeTable(Output):
                 report=report,
                 should_stop=lambda: bool(stops),
             )
-            tables = make_table(self.name, work, rows, budget)
+            tables = self._make(work, budget)
         text = "\n".join(to_markdown(table) for table in tables)
         files = [str(self.out / f"{self.name}.{ending}") for ending in ("md", "tex", "html")]
         return Outcome(f"{text}\n{', '.join(files)}", {"files": files, "tables": plain(tables)})
+
+    def _make(self, work: Work, budget: Budget) -> list[Table]:
+        if self.name == "ttopt":
+            store = work.store if self.fit_data is None else open_store(self.fit_data)
+            fit_work = replace(work, store=store, split=self.fit_split)
+            return make_learning_curves(work, fit_work, chosen([*fitted_rows(), *scratch_rows()], self.rows), budget)
+        if self.name == "scaling":
+            return make_scaling(work, chosen(scaling_rows(work.store, work.split), self.rows), budget)
+        return make_table(self.name, work, chosen(ROWS[self.name](), self.rows), budget)
 
     def _store(self, report: Report) -> PatchStore:
         if self.data is not None:

@@ -29,8 +29,9 @@ class FieldSize:
 
     def __str__(self) -> str:
         return (
-            f"photos encoded at {self.encoder_side_px} px, fields {self.width} wide, codes of {self.code_size}, "
-            f"{self.samples} samples a ray, {self.patches_per_step} cars x {self.rays_per_patch} rays a step"
+            f"photos encoded at {self.encoder_side_px} px, fields {self.width} wide and half as deep as in "
+            f"their papers, codes of {self.code_size}, {self.samples} samples a ray, "
+            f"{self.patches_per_step} cars x {self.rays_per_patch} rays a step"
         )
 
 
@@ -61,7 +62,7 @@ BUDGETS: dict[BudgetName, Budget] = {
         name="cpu",
         cpu_seconds=300.0,
         size=FieldSize(
-            encoder_side_px=64, width=128, code_size=128, samples=24, patches_per_step=16, rays_per_patch=64
+            encoder_side_px=64, width=128, code_size=128, samples=20, patches_per_step=16, rays_per_patch=48
         ),
         scored=100,
     ),
@@ -92,17 +93,17 @@ def _shrunk(config: TrainConfig, budget: Budget) -> TrainConfig:
             pretrained=None,
             num_features=SMALL_PYRAMID_FEATURES,
         ),
-        "sampling": replace(config.model.sampling, coarse=size.samples, fine=0)  # type: ignore[union-attr]
-        if "sampling" in fields
-        else SamplingConfig(),
+        "sampling": SamplingConfig(coarse=size.samples, fine=0),
         "width": size.width,
+        "depth": (getattr(config.model, "depth", 0) + 1) // 2,
+        "skip_after": None,
         "code_size": size.code_size,
     }
     model: Any = replace(config.model, **{name: value for name, value in changes.items() if name in fields})
     return replace(
         config,
         model=model,
-        schedule=ScheduleConfig(first=2e-3, last=1e-4, decay_steps=None, warmup_steps=100),
+        schedule=ScheduleConfig(first=2e-3, last=1e-4, decay_steps=None, warmup_steps=50),
         patches_per_step=size.patches_per_step,
         rays_per_patch=size.rays_per_patch,
         precision="auto",

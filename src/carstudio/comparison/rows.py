@@ -8,7 +8,7 @@ from carstudio.errors import InputError
 from carstudio.recipes import recipe
 from carstudio.training.trainer import TrainConfig
 
-SPLITS = {"zero-shot": "instance", "multi-view": "view", "scaling": "instance"}
+SPLITS = {"zero-shot": "instance", "multi-view": "view", "scaling": "instance", "ttopt": "instance"}
 
 
 @dataclass(frozen=True)

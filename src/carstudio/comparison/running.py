@@ -64,6 +64,14 @@ class Finished:
 
 def finish_row(work: Work, row: Row) -> Finished:
     """Train and score what is missing; `InputError` when the folder holds this row with other settings."""
+    row, summary = train_row(work, row)
+    folder = work.folder(row)
+    scores = [found for protocol in PROTOCOLS for found in _scores(work, row, protocol)]
+    return Finished(row, summary, _num_parameters(folder), scores, _header(folder))
+
+
+def train_row(work: Work, row: Row) -> tuple[Row, dict[str, Any]]:
+    """Train a row where that is missing; the row as it was trained, and its training's summary."""
     row = replace(row, config=replace(row.config, seed=work.seed, split=work.split))
     folder = work.folder(row)
     _claim(work, row, folder)
@@ -80,8 +88,7 @@ def finish_row(work: Work, row: Row) -> Finished:
             processes=min(work.processes, row.config.patches_per_step),
         )
         write_json(folder / SUMMARY, asdict(summary))
-    scores = [found for protocol in PROTOCOLS for found in _scores(work, row, protocol)]
-    return Finished(row, dict(read_json(folder / SUMMARY)), _num_parameters(folder), scores, _header(folder))
+    return row, dict(read_json(folder / SUMMARY))
 
 
 def open_model(work: Work, row: Row) -> CategoryModel:

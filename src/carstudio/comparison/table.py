@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 from carstudio import __version__
 from carstudio.comparison.budgets import Budget, within
@@ -16,6 +17,7 @@ TITLES = {
     "zero-shot": "Single-view supervision, cars never seen (the paper's Table II)",
     "multi-view": "Single-view against multi-view supervision (the paper's Table III)",
     "scaling": "More training cars, recolouring, and smaller images",
+    "ttopt": "Test-time optimisation (the paper's learning curve)",
 }
 
 
@@ -42,9 +44,14 @@ def make_table(name: str, work: Work, rows: Sequence[Row], budget: Budget) -> li
 
 def facts(work: Work, finished: Sequence[Finished], budget: Budget) -> tuple[tuple[str, str], ...]:
     """What holds for all rows: budget, size, data, split, seed, cost, command."""
+    return facts_of(work, [(done.row, done.summary) for done in finished], budget)
+
+
+def facts_of(work: Work, trained: Sequence[tuple[Row, dict[str, Any]]], budget: Budget) -> tuple[tuple[str, str], ...]:
+    """`facts` of rows and their trainings' summaries."""
     parts = {part: work.store.patch_ids(split=work.split, part=part) for part in ("train", "test")}
-    spent = sum(float(done.summary["cpu_seconds"]) for done in finished)
-    by_row = "; ".join(f"{d.row.name} {d.summary['steps']:,} / {d.summary['cpu_seconds']:,.0f}" for d in finished)
+    spent = sum(float(summary["cpu_seconds"]) for _, summary in trained)
+    by_row = "; ".join(f"{row.name} {summary['steps']:,} / {summary['cpu_seconds']:,.0f}" for row, summary in trained)
     return (
         ("budget", str(budget)),
         ("data", f"{work.store.path.name}, sha256 {work.store.data_sha256[:16]}"),

@@ -5,7 +5,8 @@ that were fitted are scored beside them, by name.
 """
 
 import copy
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
@@ -18,7 +19,8 @@ from carstudio.evaluation.metrics import score_image
 from carstudio.evaluation.perceptual import Lpips
 from carstudio.evaluation.protocols import EvaluationConfig, ScoredView, ViewPair, result_row
 from carstudio.evaluation.results import ResultRow
-from carstudio.fitting.optimise import FitConfig, field_parameters
+from carstudio.fitting.optimise import FitConfig
+from carstudio.geometry.orbit import viewing_angles
 from carstudio.models.interface import CategoryModel, Latents, render_image
 from carstudio.progress import Report, silent
 from carstudio.training.batches import stack_boxes
@@ -44,6 +46,8 @@ class CurveConfig:
     """Cars fitted together; where the field is fitted they share it."""
     fitted_views: int = 2
     """Views per car that were fitted and are scored too."""
+    split: str = "view"
+    """Split by view: the training part is fitted, the test part scored."""
     seed: int = 0
     """Which pixels."""
 
@@ -59,17 +63,19 @@ class CurvePoint:
     steps: int
     views: Views
     scored: ScoredView
+    turned_deg: float = 0.0  # how far around the car from the nearest view that was fitted
 
     def row(self, config: CurveConfig, *, method: str, steps: int, data_sha256: str, sha256: str) -> dict[str, Any]:
         """The contract's row, with `fit_steps`, `fit_field` and `views` beside it."""
-        protocol = EvaluationConfig(protocol="novel-view", split="view", part=_part(self.views), seed=config.seed)
+        protocol = EvaluationConfig(protocol="novel-view", split=config.split, part=_part(self.views), seed=config.seed)
         row: ResultRow = result_row(
             self.scored, protocol, method=method, steps=steps, data_sha256=data_sha256, checkpoint_sha256=sha256
         )
         if self.views == "fitted":
             row = replace(row, protocol="input-view")
         fits_field = config.field_rate > 0
-        return asdict(row) | {"fit_steps": self.steps, "fit_field": fits_field, "views": self.views}
+        about = {"fit_steps": self.steps, "fit_field": fits_field, "views": self.views}
+        return asdict(row) | about | {"turned_deg": round(self.turned_deg, 1)}
 
 
 def _part(views: Views) -> Literal["train", "test"]:
@@ -85,14 +91,14 @@ class FittableCar:
     held_out: tuple[str, ...]
 
 
-def fittable_cars(store: PatchStore) -> list[FittableCar]:
-    """Cars that have views on both sides of split `view`; `InputError` when there is none."""
+def fittable_cars(store: PatchStore, split: str = "view") -> list[FittableCar]:
+    """Cars that have views on both sides of a split by view; `InputError` when there is none."""
     table = store.table(["patch_id", "instance_id", "box_center"])
     columns = (table[name].to_pylist() for name in ("patch_id", "instance_id", "box_center"))
     instance_of = {patch: car for patch, car, center in zip(*columns, strict=True) if center is not None}
     views: dict[str, dict[str, list[str]]] = {}
     for part in ("train", "test"):
-        for patch in store.patch_ids(kept=True, split="view", part=part):
+        for patch in store.patch_ids(kept=True, split=split, part=part):
             if patch in instance_of:
                 views.setdefault(instance_of[patch], {"train": [], "test": []})[part].append(patch)
     cars = [
@@ -101,8 +107,11 @@ def fittable_cars(store: PatchStore) -> list[FittableCar]:
         if parts["train"] and parts["test"]
     ]
     if not cars:
-        raise InputError(f"{store.path}: no car has kept views on both sides of split 'view'; see `dataset info`")
+        raise InputError(f"{store.path}: no car has kept views on both sides of split {split!r}; see `dataset info`")
     return cars
+
+
+OnFitted = Callable[[FittableCar, CategoryModel, Latents], None]
 
 
 @dataclass(frozen=True)
@@ -118,26 +127,35 @@ def learning_curve(
     config: CurveConfig,
     *,
     lpips: Lpips | None = None,
+    on_fitted: OnFitted | None = None,
     report: Report = silent,
 ) -> list[CurvePoint]:
-    """Fit the cars and score their views at each mark; with marks of 0 alone, zero-shot. The model stays as it is."""
+    """Fit the cars and score their views at each mark; with marks of 0 alone, zero-shot. The model stays as it is.
+
+    `on_fitted(car, model, latents)` sees each car after the last mark.
+    """
     cache = PatchCache(store, model.encoder_side_px)
     points: list[CurvePoint] = []
     for first in range(0, len(cars), config.cars_per_batch):
         batch = cars[first : first + config.cars_per_batch]
-        points += _curve_of_batch(model, cache, batch, config, lpips)
+        points += _curve_of_batch(model, cache, batch, config, lpips, on_fitted)
         report("learning curve", first + len(batch), len(cars), "")
     return sorted(points, key=lambda point: point.steps)
 
 
 def _curve_of_batch(
-    model: CategoryModel, cache: PatchCache, cars: Sequence[FittableCar], config: CurveConfig, lpips: Lpips | None
+    model: CategoryModel,
+    cache: PatchCache,
+    cars: Sequence[FittableCar],
+    config: CurveConfig,
+    lpips: Lpips | None,
+    on_fitted: OnFitted | None,
 ) -> list[CurvePoint]:
     snapshots: dict[int, _Snapshot] = {}
 
     def watch(step: int, model: CategoryModel, latents: Latents) -> None:
         if step in config.marks:
-            weights = {name: p.detach().clone() for name, p in field_parameters(model)} if config.field_rate else {}
+            weights = {name: p.detach().clone() for name, p in model.field_parameters()} if config.field_rate else {}
             snapshots[step] = _Snapshot(_copied(latents), weights)
 
     fit_config = FitConfig(steps=max(config.marks), latent_rate=config.latent_rate, field_rate=config.field_rate)
@@ -150,8 +168,18 @@ def _curve_of_batch(
             latents = snapshot.latents.select(index)
             for patch in car.held_out + car.fitted[: config.fitted_views]:
                 scored = score_fitted(shown, latents, cache[car.fitted[0]], cache[patch], lpips)
-                points.append(CurvePoint(steps, "held-out" if patch in car.held_out else "fitted", scored))
+                views: Views = "held-out" if patch in car.held_out else "fitted"
+                points.append(CurvePoint(steps, views, scored, turned_deg(cache[patch], photos[index])))
+            if on_fitted is not None and steps == max(config.marks):
+                on_fitted(car, shown, latents)
     return points
+
+
+def turned_deg(patch: PreparedPatch, others: Sequence[PreparedPatch]) -> float:
+    """How far around the car a patch was taken from the nearest of the others, degrees."""
+    azimuth = float(viewing_angles(patch.box)[0])
+    around = [abs(math.remainder(azimuth - float(viewing_angles(other.box)[0]), 2 * math.pi)) for other in others]
+    return math.degrees(min(around))
 
 
 def _copied(latents: Latents) -> Latents:

@@ -32,7 +32,7 @@ class FitConfig:
     latent_rate: float = 1e-2
     """Learning rate of the latents (Adam)."""
     field_rate: float = 0.0
-    """Learning rate of the model's own weights, the encoder aside; 0: they stay as they are, to the bit."""
+    """Learning rate of the model's own weights (its `field_parameters`); 0: they stay as they are, to the bit."""
     patience: int = 5
     """Stop after so many looks at the held-out pixels without a better one; the best is kept."""
     look_every: int = 10
@@ -111,14 +111,16 @@ def fit(
     fitted and its changed weights are returned. `watch(steps done, model, latents)` sees the state before every step
     and after the last one.
     """
-    if not model.is_coded:
-        raise InputError("this model has no codes to fit: it looks a car up in its photo; fit one that has")
+    if not model.is_coded and config.steps and not config.field_rate:
+        raise InputError("this model has no codes to fit: it looks a car up in its photo; only its field can be fitted")
     if config.steps == 0:
         if watch is not None:
             watch(0, model, start)
-        return Fitted(Latents(start.shape.detach().clone(), start.texture.detach().clone()), {}, (), 0)
+        return Fitted(
+            replace(start, shape=start.shape.detach().clone(), texture=start.texture.detach().clone()), {}, (), 0
+        )
     fitted = copy.deepcopy(model) if config.field_rate else model
-    weights = dict(field_parameters(fitted)) if config.field_rate else {}
+    weights = dict(fitted.field_parameters()) if config.field_rate else {}
     frozen = {name: p.requires_grad for name, p in fitted.named_parameters()}
     for name, parameter in fitted.named_parameters():
         parameter.requires_grad_(name in weights)
@@ -142,9 +144,8 @@ class _State:
         freedom: BoxFreedom,
     ) -> None:
         self.model, self.weights, self.freedom = model, weights, freedom
-        self.latents = Latents(
-            start.shape.detach().clone().requires_grad_(), start.texture.detach().clone().requires_grad_()
-        )
+        shape, texture = (code.detach().clone().requires_grad_() for code in (start.shape, start.texture))
+        self.latents = Latents(shape, texture, start.pixels)
         self.photos, self.given = pixels.car, pixels.box
         self.moves = BoxMoves.none(len(pixels.car), len(start.shape), start.shape)
         self.moves.photo.requires_grad_(freedom.refine_pose)
@@ -190,14 +191,14 @@ class _State:
         if self.moves_boxes:
             box = moved_boxes(box, pixels.car, self.moves, self.freedom)
             pixels = replace(pixels, box=Box3D(box.center.detach(), box.size.detach(), box.rotation.detach()))
-        of_photos = Latents(self.latents.shape[pixels.car], self.latents.texture[pixels.car])
+        of_photos = self.latents.select(pixels.car)
         return self.model.render_levels(pixels.rays, of_photos, box), pixels
 
     def fitted(self, best: "_Best", steps: int) -> Fitted:
         shape, texture, photo, car, *weights = best.tensors
         moves = BoxMoves(photo, car)
         return Fitted(
-            Latents(shape, texture),
+            Latents(shape, texture, self.latents.pixels),
             dict(zip(self.weights, weights, strict=True)),
             tuple(tuple(curve) for curve in best.curves),
             steps,
@@ -237,12 +238,6 @@ def _descend(
     elif not best.is_past:
         best.look(done, state.loss_of_each(held_out, objective))
     return state.fitted(best, done)
-
-
-def field_parameters(model: CategoryModel) -> list[tuple[str, torch.nn.Parameter]]:
-    """The parameters that act after encoding: all but those of the encoder and of the heads that make its codes."""
-    encoding = ("encoder.", "shape_head.", "texture_head.", "shape_norm.", "texture_norm.", "colour_skip.")
-    return [(name, p) for name, p in model.named_parameters() if not name.startswith(encoding)]
 
 
 def known_hits(pixels: FitPixels) -> Bool[Tensor, "photo ray"]:

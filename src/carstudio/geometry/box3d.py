@@ -42,7 +42,7 @@ class Box3D:
         cube = self.center.new_tensor(CUBE_CORNERS)
         return (cube * self.size[..., None, :] / 2) @ self.rotation.mT + self.center[..., None, :]
 
-    def select(self, rows: slice) -> "Box3D":
+    def select(self, rows: slice | Tensor) -> "Box3D":
         """Some of the batch entries."""
         return Box3D(self.center[rows], self.size[rows], self.rotation[rows])
 

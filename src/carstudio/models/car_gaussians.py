@@ -81,6 +81,12 @@ class CarGaussians(CategoryModel):
         """ImageNet weights for the encoder where the config asks for them and they can be had."""
         return load_imagenet(self.encoder, self.config.encoder)
 
+    def field_parameters(self) -> list[tuple[str, nn.Parameter]]:
+        """One number for each number of a Gaussian: template and last biases (0.1 MB; as good as all weights)."""
+        template = ["geometry.mean", "geometry.scale", "geometry.quaternion", "geometry.opacity"]
+        own = {*template, "geometry.offsets.bias", "colour.colours.bias", "colour.tint.1.bias"}
+        return [(name, parameter) for name, parameter in self.named_parameters() if name in own]
+
     def encode(self, patches: PatchBatch) -> Latents:
         """Codes of shape and texture."""
         features = torch.cat([self.encoder(patches.image, patches.mask), pose_features(patches)], dim=-1)

@@ -46,7 +46,6 @@ class CodeNeRF(FieldModel):
         super().__init__()
         self.config = config
         self.sampling = config.sampling
-        self._row_of = {name: row for row, name in enumerate(config.cars)}
         count, scale = max(1, len(config.cars)), (2 / config.code_size) ** 0.5
         self.shape_codes = nn.Parameter(torch.randn(count, config.code_size) * scale)
         self.texture_codes = nn.Parameter(torch.randn(count, config.code_size) * scale)
@@ -58,16 +57,9 @@ class CodeNeRF(FieldModel):
 
     def encode(self, patches: PatchBatch) -> Latents:
         """Each car's codes; the mean of all codes for a car that has none."""
-        shape, texture = (self._of(codes, patches.instance_ids) for codes in self.code_parameters())
+        cars, wanted = self.config.cars, patches.instance_ids
+        shape, texture = (codes_of(codes, cars, wanted) for codes in (self.shape_codes, self.texture_codes))
         return Latents(shape, texture)
-
-    def _of(self, codes: Float[Tensor, "car code"], instance_ids: tuple[str, ...]) -> Float[Tensor, "batch code"]:
-        rows = [self._row_of.get(name) for name in instance_ids]
-        known = codes[torch.tensor([0 if row is None else row for row in rows], device=codes.device)]
-        if None not in rows:
-            return known
-        is_known = torch.tensor([row is not None for row in rows], device=codes.device)
-        return torch.where(is_known[:, None], known, codes.mean(dim=0))
 
     def query(
         self, gaussians: Gaussians, view_directions: Float[Tensor, "batch ray 3"], latents: Latents
@@ -102,11 +94,11 @@ class CodeNeRFField(nn.Module):
     ) -> tuple[Float[Tensor, "batch ray sample"], Float[Tensor, "batch ray sample 3"]]:
         """Density per canonical unit (softplus) and colour (sigmoid)."""
         shape, texture = latents.shape[:, None, None], latents.texture[:, None, None]
-        hidden = torch.relu(self.position_in(_encode(points, self.config.position_frequencies)))
+        hidden = torch.relu(self.position_in(encode_points(points, self.config.position_frequencies)))
         for code_in, layer in zip(self.shape_in, self.shape_layers, strict=True):
             hidden = torch.relu(layer(hidden + torch.relu(code_in(shape))))
         density = nn.functional.softplus(self.density(hidden).squeeze(-1).float())
-        direction = _encode(view_directions, self.config.direction_frequencies)[:, :, None]
+        direction = encode_points(view_directions, self.config.direction_frequencies)[:, :, None]
         direction = direction.expand(*points.shape[:3], -1)
         hidden = torch.relu(self.direction_in(torch.cat([self.bottleneck(hidden), direction], dim=-1)))
         for code_in, layer in zip(self.texture_in, self.texture_layers, strict=True):
@@ -115,6 +107,19 @@ class CodeNeRFField(nn.Module):
         return density, torch.sigmoid(colour.float())
 
 
-def _encode(values: Float[Tensor, "*shape 3"], count: int) -> Float[Tensor, "*shape feature"]:
+def codes_of(
+    codes: Float[Tensor, "car code"], cars: tuple[str, ...], wanted: tuple[str, ...]
+) -> Float[Tensor, "batch code"]:
+    """Rows of the wanted cars; the mean of all rows for a car that has none."""
+    row_of = {name: row for row, name in enumerate(cars)}
+    rows = [row_of.get(name) for name in wanted]
+    known = codes[torch.tensor([0 if row is None else row for row in rows], device=codes.device)]
+    if None not in rows:
+        return known
+    is_known = torch.tensor([row is not None for row in rows], device=codes.device)
+    return torch.where(is_known[:, None], known, codes.mean(dim=0))
+
+
+def encode_points(values: Float[Tensor, "*shape 3"], count: int) -> Float[Tensor, "*shape feature"]:
     """The values themselves, then sines and cosines of NeRF's octaves."""
     return torch.cat([values, positional_encoding(values, octaves(count, values))], dim=-1)

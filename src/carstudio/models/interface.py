@@ -49,7 +49,7 @@ class PixelFeatures:
     camera: Camera
     box: Box3D
 
-    def select(self, rows: slice) -> "PixelFeatures":
+    def select(self, rows: slice | Tensor) -> "PixelFeatures":
         """Some of the batch entries."""
         camera = Camera(self.camera.intrinsics[rows], self.camera.width, self.camera.height)
         return PixelFeatures(self.map[rows], camera, self.box.select(rows))
@@ -67,7 +67,7 @@ class Latents:
     texture: Float[Tensor, "batch texture_code"]
     pixels: PixelFeatures | None = None
 
-    def select(self, index: int | slice) -> "Latents":
+    def select(self, index: int | slice | Tensor) -> "Latents":
         """Latents of some of the batch entries, still a batch."""
         rows = slice(index, index + 1) if isinstance(index, int) else index
         pixels = None if self.pixels is None else self.pixels.select(rows)
@@ -92,6 +92,12 @@ class CategoryModel(nn.Module):
     def code_parameters(self) -> tuple[nn.Parameter, ...]:
         """Parameters that are codes of the cars trained on (auto-decoders); they may learn at a rate of their own."""
         return ()
+
+    def field_parameters(self) -> list[tuple[str, nn.Parameter]]:
+        """What fitting a car may change beside its latents: all that acts after encoding, unless a model says less."""
+        encoding = ("encoder.", "shape_head.", "texture_head.", "shape_norm.", "texture_norm.", "colour_skip.")
+        codes = {id(parameter) for parameter in self.code_parameters()}
+        return [(n, p) for n, p in self.named_parameters() if not n.startswith(encoding) and id(p) not in codes]
 
     def encode(self, patches: PatchBatch) -> Latents:
         """Latents of the cars in the patches."""

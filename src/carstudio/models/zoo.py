@@ -11,9 +11,10 @@ from carstudio.models.car_gaussians import CarGaussians, CarGaussiansConfig
 from carstudio.models.car_nerf import CarNeRF, CarNeRFConfig
 from carstudio.models.code_nerf import CodeNeRF, CodeNeRFConfig
 from carstudio.models.interface import CategoryModel
+from carstudio.models.nsg import NSG, NSGConfig
 from carstudio.models.pixel_nerf import PixelNeRF, PixelNeRFConfig
 
-ModelConfig = CarNeRFConfig | CarGaussiansConfig | AutoRFConfig | PixelNeRFConfig | CodeNeRFConfig
+ModelConfig = CarNeRFConfig | CarGaussiansConfig | AutoRFConfig | PixelNeRFConfig | CodeNeRFConfig | NSGConfig
 
 MODELS: dict[str, tuple[type[Any], type[CategoryModel]]] = {
     "car-nerf": (CarNeRFConfig, CarNeRF),
@@ -21,6 +22,7 @@ MODELS: dict[str, tuple[type[Any], type[CategoryModel]]] = {
     "autorf": (AutoRFConfig, AutoRF),
     "pixelnerf": (PixelNeRFConfig, PixelNeRF),
     "code-nerf": (CodeNeRFConfig, CodeNeRF),
+    "nsg": (NSGConfig, NSG),
 }
 
 

@@ -7,7 +7,7 @@ light and a dark page.
 import io
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import matplotlib
 from matplotlib.axes import Axes
@@ -21,6 +21,7 @@ GRID = "#7d859033"
 BLUE = "#3b82f6"
 TEAL = "#14a38b"
 AMBER = "#e8833a"
+LINES = (BLUE, TEAL, AMBER, INK, "#a855f7", "#e5484d")
 PIXELS_PER_INCH = 160
 SMOOTHING = 0.9  # weight of the past in the running mean drawn over a noisy curve
 
@@ -63,6 +64,36 @@ def bars(
     return figure_bytes(figure, style)
 
 
+class Point(NamedTuple):
+    """A value with its interval at a place on the x axis."""
+
+    x: float
+    value: float
+    low: float
+    high: float
+
+
+def curves(
+    series: Mapping[str, Sequence[Point]], *, title: str, x: str, style: PlotFormat = "png", ground: str = "white"
+) -> bytes:
+    """Lines through points with their intervals, over a logarithmic x axis; `ground` is the paper's colour."""
+    figure = Figure(figsize=(8.0, 3.4), layout="constrained", facecolor=ground)
+    axes = figure.subplots()
+    for number, (name, points) in enumerate(series.items()):
+        colour = LINES[number % len(LINES)]
+        errors = [[p.value - p.low for p in points], [p.high - p.value for p in points]]
+        axes.errorbar([p.x for p in points], [p.value for p in points], yerr=errors, color=colour, marker="o",
+                      capsize=3, linewidth=1.6, label=name)  # fmt: skip
+    axes.set_xscale("log")
+    places = sorted({point.x for points in series.values() for point in points})
+    axes.set_xticks(places, [f"{place:,.0f}" for place in places])
+    axes.minorticks_off()
+    dress(axes, title)
+    axes.set_xlabel(x, color=INK, fontsize=9)
+    figure.legend(fontsize=8, frameon=False, labelcolor=INK, loc="outside right upper")
+    return figure_bytes(figure, style, is_transparent=False)
+
+
 def _series(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[list[float], list[float]]:
     """Steps and values of one figure, without what is missing or not finite."""
     pairs = [(row["step"], row.get(name)) for row in rows]
@@ -103,11 +134,11 @@ def dress(axes: Axes, title: str) -> None:
         spine.set_color(INK)
 
 
-def figure_bytes(figure: Figure, style: PlotFormat) -> bytes:
+def figure_bytes(figure: Figure, style: PlotFormat, *, is_transparent: bool = True) -> bytes:
     """The same figure gives the same bytes: no date, no random ids."""
     buffer = io.BytesIO()
     metadata: dict[str, Any] = {"Date": None} if style == "svg" else {"Software": None}
     with matplotlib.rc_context({"svg.hashsalt": "carstudio"}):
         FigureCanvasAgg(figure)
-        figure.savefig(buffer, format=style, dpi=PIXELS_PER_INCH, transparent=True, metadata=metadata)
+        figure.savefig(buffer, format=style, dpi=PIXELS_PER_INCH, transparent=is_transparent, metadata=metadata)
     return buffer.getvalue()

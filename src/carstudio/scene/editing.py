@@ -51,21 +51,18 @@ def apply_edits(scene: Scene, edits: Sequence[Edit], shelf: CarShelf) -> Edited:
         try:
             result = _DO[type(edit)](result, edit, shelf, around)
         except InputError as error:
-            if edit.where().partition(" line ")[0] in str(error).partition(" line ")[0]:
-                raise  # says its line itself
-            raise _at(edit, number, error) from error
+            field = error.field if isinstance(error, _FieldError) else "op"
+            place = edit.where(field) or f"edit {number} ({edit.op})"
+            raise InputError(f"{place}: {error}") from error
     return Edited(result, tuple(warnings_of(scene, result, around)))
 
 
-def _at(edit: Edit, number: int, error: InputError) -> InputError:
-    place = edit.where()
-    return InputError(f"{place}: {error}" if " line " in place else f"edit {number} ({place}): {error}")
+class _FieldError(InputError):
+    """What is wrong with one field of an edit; where that stands is known to `apply_edits`."""
 
-
-def _problem(edit: Edit, field: str, text: str) -> InputError:
-    """An error at the line of a field, where the edit comes from a file."""
-    place = edit.where(field)
-    return InputError(f"{place}: {text}" if " line " in place else text)
+    def __init__(self, field: str, text: str) -> None:
+        super().__init__(text)
+        self.field = field
 
 
 def frames_of(scene: Scene, edit: Edit) -> list[SceneFrame]:
@@ -76,13 +73,13 @@ def frames_of(scene: Scene, edit: Edit) -> list[SceneFrame]:
     found = [frame for frame in scene.frames if first <= frame.index <= last]
     if not found:
         there = as_ranges(frame.index for frame in scene.frames)
-        raise _problem(edit, "frames", f"the scene has no frame of {first}-{last}; it has {there}")
+        raise _FieldError("frames", f"the scene has no frame of {first}-{last}; it has {there}")
     return found
 
 
 def _track(scene: Scene, edit: Any) -> Track:
     if edit.track not in scene.tracks:
-        raise _problem(edit, "track", f"no track {edit.track!r}{nearest(edit.track, scene.tracks, 'tracks')}")
+        raise _FieldError("track", f"no track {edit.track!r}{nearest(edit.track, scene.tracks, 'tracks')}")
     return scene.tracks[edit.track]
 
 
@@ -92,14 +89,13 @@ def _boxes(scene: Scene, edit: Any) -> tuple[Track, dict[int, PlacedBox]]:
     boxes = {index: box for index, box in track.boxes.items() if index in frames}
     if not boxes:
         there = as_ranges(track.boxes)
-        raise _problem(edit, "frames", f"track {edit.track} has no box in these frames; it is there in {there}")
+        raise _FieldError("frames", f"track {edit.track} has no box in these frames; it is there in {there}")
     return track, boxes
 
 
 def _drawable(track: Track, edit: Edit) -> Track:
     if track.car is None:
-        raise _problem(
-            edit,
+        raise _FieldError(
             "track",
             f"track {track.track_id} has no car (no photograph shows it well enough); it can be deleted or replaced",
         )
@@ -127,13 +123,13 @@ def _each(scene: Scene, edit: Any, change: Callable[[PlacedBox, SceneFrame], Pla
 
 def _insert(scene: Scene, edit: Insert, shelf: CarShelf, around: Surroundings) -> Scene:
     if edit.track is not None and edit.track in scene.tracks:
-        raise _problem(edit, "track", f"there is a track {edit.track!r} already; give the new one another id")
+        raise _FieldError("track", f"there is a track {edit.track!r} already; give the new one another id")
     if edit.frame == "car":
-        raise _problem(edit, "frame", "a new car has no box to count from; use camera, world or path")
+        raise _FieldError("frame", "a new car has no box to count from; use camera, world or path")
+    name = check_id(edit.track or _new_id(scene), "track")
     ref = _car(scene, edit, shelf)
     size = edit.size_m or shelf.load(ref).size
     boxes = boxes_along(edit.poses, edit.frame, _driven(scene, edit), size, scene, around)
-    name = check_id(edit.track or _new_id(scene), "track")
     return scene.with_track(Track(track_id=name, boxes=boxes, car=ref, is_drawn=True))
 
 
@@ -244,7 +240,7 @@ def _recolour(scene: Scene, edit: Recolour, shelf: CarShelf, around: Surrounding
     try:
         new = recolour_car(shelf, ref, way=edit.way, colour=edit.colour, other=other, amount=edit.amount)
     except InputError as error:
-        raise _problem(edit, "colour", str(error)) from error
+        raise _FieldError("colour", str(error)) from error
     return _with_look(scene, track, boxes, new)
 
 
@@ -264,7 +260,7 @@ def _with_look(scene: Scene, track: Track, boxes: dict[int, PlacedBox], ref: Car
 def _trajectory(scene: Scene, edit: Trajectory, shelf: CarShelf, around: Surroundings) -> Scene:
     track = _drawable(_track(scene, edit), edit)
     if not track.boxes:
-        raise _problem(edit, "track", f"track {track.track_id} has no box at all; insert it anew")
+        raise _FieldError("track", f"track {track.track_id} has no box at all; insert it anew")
     size = track.boxes[min(track.boxes)].size
     own = dict(track.boxes)
     boxes = boxes_along(edit.poses, edit.frame, _driven(scene, edit), size, scene, around, own=own)
@@ -275,7 +271,7 @@ def _car(scene: Scene, edit: Any, shelf: CarShelf) -> CarRef:
     try:
         return find_car(scene, shelf, edit.car)
     except InputError as error:
-        raise _problem(edit, "car", str(error)) from error
+        raise _FieldError("car", str(error)) from error
 
 
 _DO: dict[type[Edit], Callable[[Scene, Any, CarShelf, Surroundings], Scene]] = {

@@ -61,15 +61,14 @@ class Edit(BaseModel):
     """What all edits share. `frames`: first and last, both included; None: all."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+    op: str
     frames: Frames = None
     _lines: dict[str, int] = PrivateAttr(default_factory=dict)
     _file: str = PrivateAttr(default="")
 
     def where(self, field: str = "op") -> str:
-        """File and line of a field, for messages; what the edit is where it comes from no file."""
-        if not self._file:
-            return f"{type(self).__name__.lower()}"
-        return f"{self._file} line {self._lines.get(field, self._lines.get('op', 1))}"
+        """File and line of a field, for messages; empty where the edit comes from no file."""
+        return f"{self._file} line {self._lines.get(field, self._lines.get('op', 1))}" if self._file else ""
 
     def came_from(self, file: str, lines: dict[str, int]) -> None:
         """Remember the file and the line of each field."""

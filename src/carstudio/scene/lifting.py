@@ -6,6 +6,7 @@ the same settings; a track that cannot be lifted stays without a car and its rea
 
 import hashlib
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -16,12 +17,13 @@ import numpy as np
 import torch
 
 from carstudio.dataset.patch import MaskValue, PatchRecord
-from carstudio.dataset.pixels import PreparedPatch, prepare_patch
+from carstudio.dataset.pixels import PreparedPatch, mirror_patch, prepare_patch
 from carstudio.errors import InputError
 from carstudio.files import read_json, write_bytes, write_json
 from carstudio.fitting.car_file import DESCRIPTION, Car, load_car, save_car
 from carstudio.fitting.optimise import FitConfig
 from carstudio.geometry.box3d import Box3D
+from carstudio.geometry.orbit import viewing_angles
 from carstudio.images import to_uint8, write_png
 from carstudio.models.interface import CategoryModel, Latents, render_image
 from carstudio.perception.results import PhotoSegmenter, Segmenter
@@ -35,6 +37,10 @@ from carstudio.training.checkpoint import describe_model, load_model
 from carstudio.training.patch_fitting import fit_patches
 
 FIT_PICTURE = "fit.png"
+# A car has several photographs here, so its codes may go farther than one photograph's: on two KITTI tracks a rate of
+# 0.03 gave 0.6 dB more than 0.01 in the same steps.
+SCENE_FIT = FitConfig(latent_rate=3e-2)
+_OTHER_SIDE_RAD = math.radians(30)
 _KEY = "scene_key"  # of a car's provenance: the settings and photographs it was made from
 
 
@@ -48,8 +54,10 @@ class LiftConfig:
     """Label types that are lifted; others stay as the photographs show them."""
     views: ViewConfig = field(default_factory=ViewConfig)
     """Which photographs."""
-    fit: FitConfig = field(default_factory=FitConfig)
+    fit: FitConfig = SCENE_FIT
     """How the latents are fitted."""
+    mirrors: bool = True
+    """Also show the photographs flipped left to right where they show a side that none shows: cars are symmetric."""
     rays: int = 256
     """Pixels per photograph and step."""
     seed: int = 0
@@ -111,7 +119,8 @@ def lift_tracks(
 def fit_track(model: CategoryModel, track: Track, records: Sequence[PatchRecord], config: LiftConfig) -> Car:
     """The car that explains all patches of a track best; its provenance says from which and how well."""
     patches = [prepare_patch(record.decode(), model.encoder_side_px) for record in records]
-    fitted = fit_patches(model, patches, config.fit, rays=config.rays, seed=config.seed)
+    shown = patches + (mirrored_views(patches) if config.mirrors else [])
+    fitted = fit_patches(model, shown, config.fit, rays=config.rays, seed=config.seed)
     latents = Latents(fitted.latents.shape.cpu(), fitted.latents.texture.cpu())
     car = Car(
         latents=latents,
@@ -131,6 +140,19 @@ def fit_track(model: CategoryModel, track: Track, records: Sequence[PatchRecord]
         "settings": json.loads(json.dumps(asdict(config))),
     }
     return replace(car, provenance=provenance)
+
+
+def mirrored_views(patches: Sequence[PreparedPatch]) -> list[PreparedPatch]:
+    """The photographs flipped left to right that show a symmetric car from where no photograph does.
+
+    A log often passes a car on one side only; without them its other side is whatever the model makes of it.
+    """
+    sides = [float(viewing_angles(patch.box)[0]) for patch in patches]
+
+    def is_new(side: float) -> bool:
+        return min(abs(math.remainder(side - other, 2 * math.pi)) for other in sides) > _OTHER_SIDE_RAD
+
+    return [mirror_patch(patch) for patch, side in zip(patches, sides, strict=True) if is_new(-side)]
 
 
 def median_size(track: Track) -> tuple[float, float, float]:

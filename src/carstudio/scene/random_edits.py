@@ -10,13 +10,13 @@ import numpy as np
 
 from carstudio.errors import InputError
 from carstudio.scene.edits import Edit, Insert, Place
-from carstudio.scene.graph import PlacedBox, Scene, Track
+from carstudio.scene.graph import PlacedBox, Scene, Track, Vector3
 from carstudio.scene.places import box_standing, collide, is_in_view, posed_frames, turn_y
 from carstudio.scene.shelf import CarShelf, bundled_cars, find_car
-from carstudio.scene.standing import boxes_along, surroundings_of
+from carstudio.scene.standing import Surroundings, boxes_along, surroundings_of
 
 LANE_M = 3.2  # between the middles of two lanes: streets have 2.75 to 3.5
-_TRIES = 200
+_TRIES = 100  # in vain: the road is full
 _NEAREST_M, _FARTHEST_M = 8.0, 45.0
 _SEEN_SHARE = 1 / 3  # of the frames in which a car must be in view
 _EGO_SIZE = (4.8, 1.6, 1.9)  # KITTI's car, a Passat estate
@@ -42,16 +42,19 @@ def random_traffic(scene: Scene, shelf: CarShelf, count: int, *, seed: int) -> T
     around = surroundings_of(scene)
     edits: list[Edit] = []
     filled = _with_ego(scene)
-    for number in range(count):
+    sizes = {name: shelf.load(find_car(scene, shelf, name)).size for name in names}
+    while len(edits) < count:
+        found = None
         for _ in range(_TRIES):
             car = str(random.choice(names))
-            edit = _draw(scene, car, _free_id(scene, number), random, has_path=around.path is not None)
-            size = shelf.load(find_car(scene, shelf, car)).size
-            boxes = boxes_along(edit.poses, edit.frame, scene.frames, size, scene, around)
-            if _fits(filled, boxes):
+            edit = _draw(scene, car, _free_id(scene, len(edits)), random, has_path=around.path is not None)
+            found = _room_for(edit, sizes[car], filled, around)
+            if found is not None:
                 edits.append(edit)
-                filled = filled.with_track(Track(track_id=edit.track or "", boxes=boxes))
+                filled = filled.with_track(Track(track_id=edit.track or "", boxes=found))
                 break
+        if found is None:
+            break
     missing = count - len(edits)
     return Traffic(tuple(edits), (f"no room for {missing} of {count} cars",) if missing else ())
 
@@ -96,10 +99,14 @@ def _with_ego(scene: Scene) -> Scene:
     return scene.with_track(Track(track_id="ego", boxes={frame.index: ego for frame in scene.frames}))
 
 
-def _fits(scene: Scene, boxes: dict[int, PlacedBox]) -> bool:
-    """Whether boxes touch nothing in any frame, and are seen in enough of them."""
-    for index, box in boxes.items():
-        if any(index in track.boxes and collide(box, track.boxes[index]) for track in scene.tracks.values()):
-            return False
-    seen = sum(is_in_view(box, scene.frame(index)) for index, box in boxes.items())
-    return seen >= _SEEN_SHARE * len(boxes)
+def _room_for(edit: Insert, size: Vector3, scene: Scene, around: Surroundings) -> dict[int, PlacedBox] | None:
+    """The car's boxes where they touch nothing in any frame and are seen in enough of them; else None."""
+    boxes: dict[int, PlacedBox] = {}
+    for frame in scene.frames:
+        box = boxes_along(edit.poses, edit.frame, [frame], size, scene, around)[frame.index]
+        others = (track.boxes.get(frame.index) for track in scene.tracks.values())
+        if any(other is not None and collide(box, other) for other in others):
+            return None
+        boxes[frame.index] = box
+    seen = sum(is_in_view(boxes[frame.index], frame) for frame in scene.frames)
+    return boxes if seen >= _SEEN_SHARE * len(boxes) else None

@@ -7,7 +7,7 @@ in these pictures (`scene.paint`), and the texture code is fitted to them.
 
 import hashlib
 import json
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import torch
@@ -58,10 +58,12 @@ def recolour_car(
     colour: str | Colour | None = None,
     other: CarRef | None = None,
     amount: float | None = None,
+    config: PaintConfig | None = None,
 ) -> CarRef:
     """The car in another colour, put on the shelf; the same request gives the same car (and does no work twice)."""
     asked: dict[str, Any] = {"from": [ref.name, ref.sha256], "way": way, "amount": amount}
     asked["colour"] = None if colour is None else list(parse_colour(colour))
+    asked["config"] = None if config is None else asdict(config)
     asked["other"] = None if other is None else [other.name, other.sha256]
     checksum = hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()[:12]
     name = f"{ref.name[:80]}-{checksum}"
@@ -77,7 +79,7 @@ def recolour_car(
         texture = masked_texture(model, car, parse_colour(colour), shelf, ref, 1 - TRANSPARENCY)
     else:
         assert colour is not None
-        texture = painted_texture(model, car, parse_colour(colour))
+        texture = painted_texture(model, car, parse_colour(colour), config)
     new = replace(car, latents=Latents(car.latents.shape, texture), provenance={**car.provenance, "recoloured": asked})
     return shelf.add(new, name)
 

@@ -28,7 +28,16 @@ def build_car(style: Style, paint: Paint, rng: np.random.Generator) -> Car:
     return Car(car_mesh(parts, car_materials(paint, rng)), style.name, paint)
 
 
-def draw_car(rng: np.random.Generator) -> Car:
-    """A car drawn from the distributions of styles and paints; the same generator state gives the same car."""
-    style = draw_style(rng)
-    return build_car(style, draw_paint(rng), rng)
+def draw_car(rng: np.random.Generator, repaint: Paint | None = None) -> Car:
+    """A car drawn from the distributions of styles and paints; the same generator state gives the same car.
+
+    `repaint` takes the place of the drawn paint and changes nothing else.
+    """
+    style, paint = draw_style(rng), draw_paint(rng)
+    return build_car(style, repaint or paint, rng)
+
+
+def paint_of(rng: np.random.Generator) -> Paint:
+    """The paint that `draw_car` gives the car of this generator state; nothing is built."""
+    draw_style(rng)
+    return draw_paint(rng)

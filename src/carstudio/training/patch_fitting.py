@@ -62,8 +62,11 @@ def fit_cars(
 
 @torch.no_grad()
 def encode_cars(model: CategoryModel, cars: Sequence[Sequence[PreparedPatch]]) -> Latents:
-    """Codes of cars, one row each: the mean over a car's patches."""
+    """Codes of cars, one row each: the mean over a car's patches; pixel features are those of its largest one."""
     device = next(model.parameters()).device
+    if not model.is_coded:
+        largest = [max(car, key=lambda patch: patch.mask.numel()) for car in cars]
+        return model.encode(patch_batch(largest).to(device))
     each = [model.encode(patch_batch(list(car)).to(device)) for car in cars]
     return Latents(
         torch.stack([latents.shape.float().mean(dim=0) for latents in each]),

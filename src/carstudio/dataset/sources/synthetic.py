@@ -37,6 +37,7 @@ from carstudio.synthetic.benchmark import BENCHMARK_CARS, BENCHMARK_SEED, BENCHM
 from carstudio.synthetic.cameras import CameraKind
 from carstudio.synthetic.cars import Car, draw_car
 from carstudio.synthetic.glb import load_glb
+from carstudio.synthetic.materials import Paint
 from carstudio.synthetic.photographs import Photograph, RayCaster, Renderer, draw_photographs
 
 __all__ = ["BuildSummary", "SynthConfig", "frozen_benchmark", "synthesize"]
@@ -193,18 +194,25 @@ def instance_id(config: SynthConfig, index: int) -> str:
     return f"syn-{config.seed}-{index:06d}"
 
 
-def make_car(config: SynthConfig, files: list[Path], index: int) -> Car:
-    """The car of an index: drawn, or the mesh whose turn it is."""
+def make_car(config: SynthConfig, files: list[Path], index: int, repaint: Paint | None = None) -> Car:
+    """The car of an index: drawn (and repainted where asked), or the mesh whose turn it is."""
     if files:
         return load_glb(files[index % len(files)])
-    return draw_car(np.random.default_rng([config.seed, index]))
+    return draw_car(np.random.default_rng([config.seed, index]), repaint)
 
 
 def car_records(
-    config: SynthConfig, files: list[Path], index: int, renderer: Renderer | None = None
+    config: SynthConfig,
+    files: list[Path],
+    index: int,
+    renderer: Renderer | None = None,
+    repaint: Paint | None = None,
 ) -> tuple[PatchRecord, ...]:
-    """All patches of one car; `renderer` as the config says when it is not given."""
-    car, renderer = make_car(config, files, index), renderer or renderer_of(config)
+    """All patches of one car; `renderer` as the config says when it is not given.
+
+    With `repaint` the same photos of the same car in another colour: light, street, cameras and sensors are the same.
+    """
+    car, renderer = make_car(config, files, index, repaint), renderer or renderer_of(config)
     photographs = draw_photographs(
         car,
         seed=(config.seed, index),

@@ -77,17 +77,22 @@ class DD3D(nn.Module):
         return look(self.fcos2d_head, self.fcos3d_head, features)
 
     @torch.no_grad()
-    def fuse(self, precision: torch.dtype = torch.float32) -> "DD3D":
-        """Make it quicker, in place and for inference only: no normalisations, channels last, layers in `precision`."""
+    def fuse(self) -> "DD3D":
+        """Make it quicker, in place and for inference only: no normalisations, channels last."""
         fold_norms(self.backbone)
         self.fused_heads = FusedHeads(self.fcos2d_head, self.fcos3d_head)
         del self.fcos2d_head, self.fcos3d_head
-        self.backbone.to(precision)
-        self.fused_heads.set_precision(precision)
-        self.precision = precision
         for parameter in self.eval().requires_grad_(False).parameters():
             if parameter.dim() == 4:
                 parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
+        return self
+
+    def set_precision(self, precision: torch.dtype) -> "DD3D":
+        """Let a fused network compute in `precision`, but for the last convolutions and the decoding."""
+        assert self.fused_heads is not None, "only a fused network computes in low precision"
+        self.backbone.to(precision)
+        self.fused_heads.set_precision(precision)
+        self.precision = precision
         return self
 
     def prepare(self, images: Sequence[UInt8[Tensor, "3 _ _"]]) -> Float[Tensor, "batch 3 height width"]:

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -81,12 +80,10 @@ def read_checkpoint(file: Path) -> dict[str, Tensor]:
         raise InputError(f"{file}: expected a dictionary of weights, or one below 'model', found {_kinds(content)}")
     if all(isinstance(key, str) and key.startswith("module.") for key in weights):
         weights = {key.removeprefix("module."): value for key, value in weights.items()}
-    return {key: _as_tensor(key, value, name=str(file)) for key, value in weights.items()}
+    return {key: _tensor(key, value, name=str(file)) for key, value in weights.items()}
 
 
-def _as_tensor(key: Any, value: Any, *, name: str) -> Tensor:
-    if isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
-        value = torch.from_numpy(value)
+def _tensor(key: Any, value: Any, *, name: str) -> Tensor:
     if not isinstance(key, str) or not isinstance(value, Tensor):
         raise InputError(f"{name}: expected a tensor for every key, found {key!r:.60}: {type(value).__name__}")
     return value
