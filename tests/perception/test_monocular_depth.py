@@ -9,7 +9,7 @@ from torch import nn
 
 from carstudio.errors import InputError
 from carstudio.perception.monocular_depth import estimate_inverse_depth, input_size, open_depth_network
-from perception.tiny_hub import IMAGENET, photograph, save_processor, save_yolos
+from perception.tiny_hub import IMAGENET, photograph, save_processor, save_yolos, shake
 
 RULES = {"size": {"height": 56, "width": 56}, "keep_aspect_ratio": True, "ensure_multiple_of": 14, "resample": 3}
 
@@ -38,7 +38,7 @@ def save_depth_anything(folder: Path, kind: str = "relative") -> nn.Module:
         depth_estimation_type=kind,
         max_depth=80 if kind == "metric" else 1,
     )
-    network = DepthAnythingForDepthEstimation(config).eval()
+    network = shake(DepthAnythingForDepthEstimation(config), std=0.2)
     network.head.conv3.bias.data.fill_(2.0)  # or the last ReLU makes most of it zero
     network.save_pretrained(folder)
     save_processor(folder, do_normalize=True, **RULES, **IMAGENET)
@@ -64,7 +64,7 @@ def test_depth_is_that_of_transformers(tmp_path, shape):
     found = estimate_inverse_depth(str(tmp_path), image, device="cpu")
     assert found.shape == shape
     assert found.std() > 1e-4
-    np.testing.assert_allclose(found, by_transformers(network, image), atol=1e-4)
+    np.testing.assert_allclose(found, by_transformers(network, image), rtol=1e-3, atol=1e-3 * found.std())
 
 
 def test_metres_become_inverse_metres(tmp_path):
