@@ -77,17 +77,19 @@ def draw_frame(job: FrameJob) -> DrawnFrame:
     depth = _background(job, photo, camera, ground, points, solid, hole)
     stack = _draw_objects(job, with_car, camera, hiding_depth(depth, ground, camera))
     hole &= ~_protected(job, stack, camera)
+    on_ground = is_ground(depth, ground, camera)
     avoid = any_of((outline_mask(placed.box, camera) for placed in job.objects if not placed.is_drawn), camera)
     filled = fill_hole(
         photo,
         hole,
         avoid=avoid,
+        on_ground=on_ground,
         depth_m=depth,
         frame=job.frame,
         neighbours=job.neighbours,
         read=partial(read_photo, job.root),
     )
-    shade = _shade(job, ground, camera, is_ground(depth, ground, camera)) * (1 - stack.undrawn_weight)
+    shade = _shade(job, ground, camera, on_ground) * (1 - stack.undrawn_weight)
     rgb, touched = _painted(photo, filled.image, hole, stack, shade, job)
     instances = stack.instances()
     drawn_numbers = [placed.number for placed in with_car if placed.is_drawn]
