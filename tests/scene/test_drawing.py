@@ -206,3 +206,18 @@ def test_a_car_cut_by_the_border_is_truncated(folder, scene):
     assert 0.2 < truth.truncation < 0.9
     assert truth.box2d is not None
     assert truth.box2d[0] == 0.0
+
+
+def test_a_depth_network_hides_cars_behind_what_it_sees(folder, scene, monkeypatch):
+    """A network whose inverse depth is exact but for scale and shift: a wall 6 m ahead hides a car 9 m ahead."""
+    from carstudio.scene import drawing
+
+    camera = scene.frames[0].camera()
+    ground = find_ground(None, boxes_of(scene, 0))
+    depth = np.where(np.isfinite(ground.depth(camera)), ground.depth(camera), 80.0)
+    depth[:60, 60:100] = np.minimum(depth[:60, 60:100], 6.0)
+    monkeypatch.setattr(drawing, "estimate_inverse_depth", lambda name, photo: 3.0 / depth + 0.2)
+    edited = inserted(scene, "9", {0: placed(0.0, 9.0)})
+    hidden, free = (drawn(folder, scene, edited, depth_network=name) for name in ("wall", None))
+    seen = [next(t.num_pixels for t in frame.truths if t.track_id == "9") for frame in (hidden, free)]
+    assert seen[0] < 0.3 * seen[1]  # below row 60 its wheels are before the wall

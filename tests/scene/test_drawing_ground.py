@@ -114,7 +114,7 @@ def test_ground_lets_wheels_in_and_walls_do_not():
     assert is_ground(depth, LEVEL, CAMERA)[60:].all()
     assert (hiding_depth(depth, LEVEL, CAMERA)[60:] > depth[60:] * 1.1).all()
     wall = np.full(depth.shape, 5.0)
-    np.testing.assert_array_equal(hiding_depth(wall, LEVEL, CAMERA)[:60], wall[:60])
+    np.testing.assert_allclose(hiding_depth(wall, LEVEL, CAMERA)[:60], 5.35)  # 3 % and 0.2 m of slack
 
 
 def test_a_networks_scale_and_shift_are_found_among_outliers():

@@ -17,7 +17,8 @@ from carstudio.scene.ground import Ground, unproject_pixels
 from carstudio.scene.lidar import sparse_depth
 
 FARTHEST_M = 120.0
-_GROUND_NEAR_M, _GROUND_PER_M = 0.25, 0.01  # what is lower than this above the plane is ground: camber, kerbs, noise
+_GROUND_NEAR_M, _GROUND_PER_M = 0.25, 0.02  # what is lower than this above the plane is ground: camber, kerbs, noise
+_SLACK, _SLACK_M = 0.03, 0.2
 _SINK_M = 0.2  # the ground lets wheels in this far before it hides them: no plane is that exact
 _UNKNOWN = np.float32(1e6)
 _DIAMOND = np.array([[0, 0, 1, 0, 0], [0, 1, 1, 1, 0], [1, 1, 1, 1, 1], [0, 1, 1, 1, 0], [0, 0, 1, 0, 0]], np.uint8)
@@ -86,9 +87,14 @@ def is_ground(
 def hiding_depth(
     depth_m: Float[np.ndarray, "height width"], ground: Ground, camera: Camera
 ) -> Float[np.ndarray, "height width"]:
-    """Depth behind which the background hides cars: the background's, but ground hides only what is under it."""
+    """Depth behind which the background hides cars: the background's, but ground hides only what is under it.
+
+    Elsewhere too a little behind it is still before it: depths and boxes are not exact, and a pole that wrongly stands
+    before a car's bumper is seen at once.
+    """
     sunk = ground.depth(camera, lower_m=_SINK_M)
-    return np.where(is_ground(depth_m, ground, camera), np.maximum(depth_m, sunk), depth_m)
+    slack = depth_m * (1 + _SLACK) + _SLACK_M
+    return np.where(is_ground(depth_m, ground, camera), np.maximum(slack, sunk), slack)
 
 
 def align_depth(

@@ -11,32 +11,30 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, UInt8, UInt16
 
 from carstudio.errors import InputError
 from carstudio.files import inside
 from carstudio.geometry.camera import Camera
 from carstudio.images import decode_depth, decode_image, read_image_file
-from carstudio.models.interface import CategoryModel, Latents
 from carstudio.perception.monocular_depth import estimate_inverse_depth
 from carstudio.scene.background_depth import align_depth, background_depth, hiding_depth, is_ground
 from carstudio.scene.filling import fill_hole
 from carstudio.scene.footprint import any_of, body_mask, ground_mask, ground_rectangle, grown, outline_mask
-from carstudio.scene.frame_jobs import DrawingSettings, FrameJob, PlacedObject, frame_job
-from carstudio.scene.graph import CarRef, FileRef, PlacedBox, Scene, SceneFrame
+from carstudio.scene.frame_jobs import DrawingSettings, FrameJob, frame_job
+from carstudio.scene.graph import FileRef, PlacedBox, Scene, SceneFrame
 from carstudio.scene.ground import Ground, find_ground
-from carstudio.scene.layers import FAINTEST, bands, merge_layers, ray_lengths, trace_object
+from carstudio.scene.layers import FAINTEST
 from carstudio.scene.lidar import background_points, sparse_depth
 from carstudio.scene.matching import GAMMA
+from carstudio.scene.object_stack import ObjectStack, stack_objects
 from carstudio.scene.shadow import contact_shadow
-from carstudio.scene.shelf import CarShelf
 from carstudio.scene.truth import ObjectTruth, truth_of
 
 _OUTLINE_PX = 3  # around a deleted car's box: labels are that inexact, and cameras blur
 _HOLE_REACH_M = 0.35  # of ground around a deleted car: its contact shadow
 _SEEN = 0.25  # opacity above which an object of the photograph is not painted over by a fill behind it
-_KEPT_PHOTOS, _KEPT_CARS = 24, 32  # per process
+_KEPT_PHOTOS = 24  # per process
 # Cityscapes' label ids; what is not known is 255, which its tools ignore.
 SEMANTIC = {"Car": 26, "Van": 26, "Truck": 27, "Bus": 28, "Tram": 31, "Pedestrian": 24, "Person": 24, "Cyclist": 25}
 UNLABELLED, IGNORED = 0, 255
@@ -75,19 +73,21 @@ def draw_frame(job: FrameJob) -> DrawnFrame:
     ground = find_ground(points, boxes)
     hole = _hole(job, ground, camera)
     depth = _background(job, photo, camera, ground, points, solid, hole)
-    stack = _draw_objects(job, with_car, camera, hiding_depth(depth, ground, camera))
+    stack = stack_objects(job, with_car, camera, hiding_depth(depth, ground, camera))
     hole &= ~_protected(job, stack, camera)
+    on_ground = is_ground(depth, ground, camera)
     avoid = any_of((outline_mask(placed.box, camera) for placed in job.objects if not placed.is_drawn), camera)
     filled = fill_hole(
         photo,
         hole,
         avoid=avoid,
+        on_ground=on_ground,
         depth_m=depth,
         frame=job.frame,
         neighbours=job.neighbours,
         read=partial(read_photo, job.root),
     )
-    shade = _shade(job, ground, camera, is_ground(depth, ground, camera)) * (1 - stack.undrawn_weight)
+    shade = _shade(job, ground, camera, on_ground) * (1 - stack.undrawn_weight)
     rgb, touched = _painted(photo, filled.image, hole, stack, shade, job)
     instances = stack.instances()
     drawn_numbers = [placed.number for placed in with_car if placed.is_drawn]
@@ -137,19 +137,6 @@ def _checked(root: str, ref: FileRef, what: str) -> bytes:
     return data
 
 
-@lru_cache(maxsize=_KEPT_CARS)
-def opened_car(scene_folder: str, ref: CarRef, run: str | None) -> tuple[CategoryModel, Latents]:
-    """The car's model and latents, read once per process; `InputError` when it is not the scene's."""
-    shelf = _shelf(scene_folder, run)
-    car = shelf.load(ref)
-    return shelf.model_of(car).eval(), car.latents
-
-
-@lru_cache(maxsize=2)
-def _shelf(scene_folder: str, run: str | None) -> CarShelf:
-    return CarShelf(Path(scene_folder), () if run is None else (Path(run),))
-
-
 def _points(job: FrameJob, moving: Sequence[PlacedBox]) -> Float[np.ndarray, "n 3"] | None:
     if job.settings.depth == "ground":
         return None
@@ -187,7 +174,7 @@ def _hole(job: FrameJob, ground: Ground, camera: Camera) -> Bool[np.ndarray, "he
     return any_of(outlines, camera) | any_of(shadows, camera)
 
 
-def _protected(job: FrameJob, stack: "_Stack", camera: Camera) -> Bool[np.ndarray, "height width"]:
+def _protected(job: FrameJob, stack: ObjectStack, camera: Camera) -> Bool[np.ndarray, "height width"]:
     """Objects of the photograph that stand before all that has gone: their pixels stay."""
     kept = np.zeros((camera.height, camera.width), bool)
     if not job.gone:
@@ -199,95 +186,6 @@ def _protected(job: FrameJob, stack: "_Stack", camera: Camera) -> Bool[np.ndarra
         alone = stack.alone.get(placed.number)
         kept |= body_mask(placed.box, camera) if alone is None else grown(alone > _SEEN, 1)
     return kept
-
-
-@dataclass
-class _Stack:
-    """Sums over the objects of a frame, per pixel. Drawn and undrawn objects hide each other alike."""
-
-    rgb: Float[np.ndarray, "height width 3"]  # of drawn objects, premultiplied
-    weight: Float[np.ndarray, "height width"]  # visible share of drawn objects
-    undrawn_weight: Float[np.ndarray, "height width"]
-    depth_sum: Float[np.ndarray, "height width"]  # visible share times depth
-    best_weight: Float[np.ndarray, "height width"]
-    best_number: UInt16[np.ndarray, "height width"]
-    alone: dict[int, Float[np.ndarray, "height width"]]
-
-    def instances(self) -> UInt16[np.ndarray, "height width"]:
-        """Number of the object that most is seen of, where objects make up half of the pixel."""
-        shown = self.weight + self.undrawn_weight >= 0.5
-        return np.where(shown, self.best_number, 0).astype(np.uint16)
-
-
-def _empty_stack(height: int, width: int) -> _Stack:
-    def zeros() -> Float[np.ndarray, "height width"]:
-        return np.zeros((height, width), np.float32)
-
-    rgb, numbers = np.zeros((height, width, 3), np.float32), np.zeros((height, width), np.uint16)
-    return _Stack(rgb, zeros(), zeros(), zeros(), zeros(), numbers, {})
-
-
-def _draw_objects(
-    job: FrameJob, objects: Sequence[PlacedObject], camera: Camera, hiding_m: Float[np.ndarray, "height width"]
-) -> _Stack:
-    """All cars merged with each other and with the background, strip by strip."""
-    stack = _empty_stack(camera.height, camera.width)
-    for placed in objects:
-        stack.alone[placed.number] = np.zeros((camera.height, camera.width), np.float32)
-    if not objects:
-        return stack
-    assert all(placed.car is not None for placed in objects), "only cars can be drawn"
-    cars = [opened_car(job.scene_folder, p.car, job.settings.model) for p in objects if p.car is not None]
-    side = job.settings.rays_per_side
-    fine = camera.resize(camera.width * side, camera.height * side)
-    chunk = min(model.chunk_rays for model, _ in cars)
-    tile = max(model.tile_px for model, _ in cars) * side
-    rows = max(tile, round(2 * chunk / fine.width / tile) * tile)
-    for top, band in bands(fine, rows):
-        traced = [
-            trace_object(model, latents, placed.box.box(), band)
-            for placed, (model, latents) in zip(objects, cars, strict=True)
-        ]
-        wall = hiding_m[top // side : (top + band.height) // side].repeat(side, axis=0).repeat(side, axis=1)
-        background = torch.from_numpy(np.ascontiguousarray(wall)).float().flatten() * ray_lengths(band)
-        layers = merge_layers(traced, background)
-        for placed, layer in zip(objects, layers, strict=True):
-            pixels, weight = layer.pixels.numpy(), layer.weight.numpy() / side**2
-            row, column = (pixels // band.width + top) // side, pixels % band.width // side
-            rgb = layer.rgb.numpy() / side**2
-            parts = (weight, layer.alone.numpy() / side**2, layer.depth_m.numpy() * weight, rgb)
-            _add(stack, placed, (row, column), parts)
-    return stack
-
-
-def _add(stack: _Stack, placed: PlacedObject, at: tuple[np.ndarray, np.ndarray], parts: tuple[np.ndarray, ...]) -> None:
-    """Add one object's share of a strip, several rays to a pixel."""
-    if len(at[0]) == 0:
-        return
-    weight, alone, depth, rgb = parts
-    top, bottom = int(at[0].min()), int(at[0].max()) + 1
-    left, right = int(at[1].min()), int(at[1].max()) + 1
-    shape = (bottom - top, right - left)
-    flat = (at[0] - top) * shape[1] + at[1] - left
-
-    def summed(values: np.ndarray) -> np.ndarray:
-        return np.bincount(flat, values, shape[0] * shape[1]).reshape(shape).astype(np.float32)
-
-    part = (slice(top, bottom), slice(left, right))
-    shown = summed(weight)
-    stack.alone[placed.number][part] += summed(alone)
-    stack.depth_sum[part] += summed(depth)
-    is_best = shown > stack.best_weight[part]
-    stack.best_weight[part] = np.where(is_best, shown, stack.best_weight[part])
-    stack.best_number[part] = np.where(is_best, placed.number, stack.best_number[part])
-    if not placed.is_drawn:
-        stack.undrawn_weight[part] += shown
-        return
-    stack.weight[part] += shown
-    gain = np.array(placed.gain) ** (1 / GAMMA)
-    for channel in range(3):
-        lit = np.minimum(summed(rgb[:, channel]) * gain[channel], shown)
-        stack.rgb[(*part, channel)] += lit.astype(np.float32)
 
 
 def _shade(
@@ -306,7 +204,7 @@ def _painted(
     photo: UInt8[np.ndarray, "height width 3"],
     filled: UInt8[np.ndarray, "height width 3"],
     hole: Bool[np.ndarray, "height width"],
-    stack: _Stack,
+    stack: ObjectStack,
     shade: Float[np.ndarray, "height width"],
     job: FrameJob,
 ) -> tuple[UInt8[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]:

@@ -27,6 +27,10 @@ _RING_PX = 8
 _WRONG = 14.0  # median difference (8-bit steps, exposure matched) of the ring above which a frame is not believed
 _CLEAR_PX = 6  # from objects' outlines in the other frame: their shadows, and boxes are not exact
 _INPAINT_RADIUS_PX = 4
+_AROUND_PX = 24  # of known pixels that inpainting goes by
+_LEAST_KNOWN = 50  # pixels of the same surface; with fewer any known pixel counts
+_COARSE_FROM_PX = 8000.0
+_KNOWN_SHARE = 0.3  # of a coarse pixel
 
 Photograph = UInt8[np.ndarray, "height width 3"]
 
@@ -72,25 +76,53 @@ def fill_hole(
     hole: Bool[np.ndarray, "height width"],
     *,
     avoid: Bool[np.ndarray, "height width"],
+    on_ground: Bool[np.ndarray, "height width"],
     depth_m: Float[np.ndarray, "height width"],
     frame: SceneFrame,
     neighbours: Sequence[Neighbour],
     read: Callable[[SceneFrame], Photograph],
     inpainter: Inpainter | None = None,
 ) -> Filled:
-    """Fill `hole` and nothing else. `avoid` are other objects of the photograph, no background to compare with."""
+    """Fill `hole` and nothing else. `avoid` are other objects of the photograph: no background to go by.
+
+    `on_ground` are pixels whose background is the ground.
+    """
     filled, missing = image.copy(), hole.copy()
     if not hole.any():
         return Filled(filled, missing)
     if frame.world_from_camera is not None and neighbours:
         _from_frames(filled, missing, grown(hole, _RING_PX) & ~hole & ~avoid, depth_m, frame, neighbours, read)
     is_seen = hole & ~missing
-    if missing.any():
-        top, bottom, left, right = _window(missing, 3 * _INPAINT_RADIUS_PX + _RING_PX)
-        part = (slice(top, bottom), slice(left, right))
-        painted = (inpainter or OpenCvInpainter()).inpaint(filled[part], missing[part])
-        filled[part][missing[part]] = painted[missing[part]]
+    for surface in (on_ground, ~on_ground):
+        _paint(filled, missing & surface, surface & ~missing & ~avoid, inpainter or OpenCvInpainter())
     return Filled(filled, is_seen)
+
+
+def _paint(
+    filled: Photograph,
+    part: Bool[np.ndarray, "height width"],
+    known: Bool[np.ndarray, "height width"],
+    inpainter: Inpainter,
+) -> None:
+    """Inpaint a part of the hole from known pixels of its own surface: walls do not run into the road.
+
+    What is large is made up at a coarser scale: it is smooth anyway, and Telea's method would take seconds.
+    """
+    if not part.any():
+        return
+    top, bottom, left, right = _window(part, _AROUND_PX)
+    inside = (slice(top, bottom), slice(left, right))
+    image, wanted, source = filled[inside], part[inside], known[inside]
+    if source.sum() < _LEAST_KNOWN:
+        source = ~wanted
+    scale = max(1, round((float((~source).sum()) / _COARSE_FROM_PX) ** 0.5))
+    size = (max(1, image.shape[1] // scale), max(1, image.shape[0] // scale))
+    weight = np.asarray(cv2.resize(source.astype(np.float32), size, interpolation=cv2.INTER_AREA))
+    light = np.asarray(cv2.resize(image * source[..., None].astype(np.float32), size, interpolation=cv2.INTER_AREA))
+    coarse = np.clip(np.round(light / np.maximum(weight, 1e-3)[..., None]), 0, 255).astype(np.uint8)
+    painted = inpainter.inpaint(coarse, weight < _KNOWN_SHARE)
+    full = np.asarray(cv2.resize(painted, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_LINEAR))
+    image[wanted] = full[wanted]
 
 
 def _window(mask: Bool[np.ndarray, "height width"], margin: int) -> tuple[int, int, int, int]:

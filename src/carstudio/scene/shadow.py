@@ -15,7 +15,7 @@ from carstudio.scene.footprint import SHADOW_REACH_M, GroundRectangle, flat_mask
 from carstudio.scene.ground import Ground, unproject_pixels
 
 SOFTNESS_M = SHADOW_REACH_M / 3  # standard deviation: a car's sills and bumpers are 0.2 to 0.3 m above the ground
-DARKEST = 0.65  # share of the light that the middle of a car's underside takes; the rest comes in from the sides
+DARKEST = 0.85  # share of the light that the middle of a car's underside takes; the rest comes in from the sides
 _FLOATS_M = 0.3  # a car this far above the ground has a shadow 1 / e as dark
 
 
