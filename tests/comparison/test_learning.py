@@ -30,6 +30,7 @@ def learned(name: str, protocol: Protocol, folder: Path) -> tuple[float, float]:
     return sum(s.psnr or 0 for s in scores) / len(scores), sum(s.mask_iou or 0 for s in scores) / len(scores)
 
 
+@pytest.mark.slow
 def test_a_code_per_car_tells_both_its_colours(tmp_path: Path) -> None:
     """A car of one mean colour would score about 17 dB; the code joins all photos of a car: 24.6 dB were measured."""
     psnr, iou = learned("code-nerf", "novel-view", tmp_path)
