@@ -221,3 +221,19 @@ def test_a_depth_network_hides_cars_behind_what_it_sees(folder, scene, monkeypat
     hidden, free = (drawn(folder, scene, edited, depth_network=name) for name in ("wall", None))
     seen = [next(t.num_pixels for t in frame.truths if t.track_id == "9") for frame in (hidden, free)]
     assert seen[0] < 0.3 * seen[1]  # below row 60 its wheels are before the wall
+
+
+def test_no_shadow_falls_on_what_is_no_ground(folder, scene, monkeypatch):
+    """A network sees something 2 m ahead on the left: neither the car nor its shadow changes a pixel of it."""
+    from carstudio.scene import drawing
+
+    depth = find_ground(None, boxes_of(scene, 0)).depth(scene.frames[0].camera())
+    depth = np.where(np.isfinite(depth), depth, 80.0)
+    depth[55:, :75] = 2.0
+    monkeypatch.setattr(drawing, "estimate_inverse_depth", lambda name, photo: np.zeros(photo.shape[:2]))
+    monkeypatch.setattr(drawing, "align_depth", lambda inverse, known: depth)
+    edited = inserted(scene, "9", {0: placed(0.0, 9.0)})
+    assert drawn(folder, scene, edited).touched[55:, :75].any()
+    frame = drawn(folder, scene, edited, depth_network="near")
+    assert not frame.touched[55:, :75].any()
+    assert frame.touched[55:, 76:].any()
