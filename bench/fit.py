@@ -2,7 +2,7 @@
 
 Usage: python -m bench.fit STORE [--cars 4] [--views 8] [--rounds 3] [--threads 4]
 
-STORE has cars with several views (`carstudio synth`). Steps are those of `carstudio fit` on fresh models of the recipes:
+STORE has cars with several views (`carstudio synth`). Steps are those of `carstudio fit` on fresh models of recipes:
 256 rays of each photo of a car, 16 for models at paper size; the table gives milliseconds for 1,000 rays. Rounds are
 interleaved. The curve is of the bundled model: PSNR of views that no step saw (split `view`) against wall time, latents
 and per-Gaussian numbers fitted together.
