@@ -13,7 +13,7 @@ from training.toy import toy_store
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
     folder = tmp_path_factory.mktemp("ttopt")
-    store = toy_store(folder / "store", cars=3, views=4)
+    store = toy_store(folder / "store", cars=2, views=3)
     command = ["table", "ttopt", "--data", str(store.path), "--out", str(folder / "out"), "--budget", "smoke"]
     command += ["--steps", "3", "--rows", "car-gaussians", "nsg", "--device", "cpu", "--quiet"]
     assert run(command) == 0
