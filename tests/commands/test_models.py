@@ -124,6 +124,9 @@ def test_offline_is_told_with_the_way_out(monkeypatch: pytest.MonkeyPatch, capsy
         (["download", "nonsense"], "expected OWNER/MODEL as on the hub, or one of dfine-medium-obj2coco"),
         (["list", "--out", "x"], "--out is for download"),
         (["list", "/no/such/folder"], "/no/such/folder: no config.json"),
+        (["convert"], "expected dd3d CHECKPOINT.pth --out FOLDER, found nothing without --out"),
+        (["convert", "dd3d", "a.pth"], "expected dd3d CHECKPOINT.pth --out FOLDER, found dd3d a.pth without --out"),
+        (["convert", "yolo", "a.pth", "--out", "x"], "expected dd3d CHECKPOINT.pth --out FOLDER, found yolo a.pth"),
     ],
 )
 def test_wrong_use_is_told(arguments: list[str], told: str, capsys: pytest.CaptureFixture[str]) -> None:

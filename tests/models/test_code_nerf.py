@@ -30,9 +30,9 @@ def named(*names: str) -> PatchBatch:
 
 def test_parameter_counts_by_hand() -> None:
     net = CodeNeRF(with_cars(code_nerf().model, tuple("abcdefg")))  # type: ignore[arg-type]
-    shape = linear(63, 256) + 2 * (linear(256, 256) + linear(256, 256)) + linear(256, 1)
+    shape = linear(63, 256) + 3 * (linear(256, 256) + linear(256, 256)) + linear(256, 1)
     colour = linear(256, 256) + linear(256 + 27, 256) + 2 * linear(256, 256) + linear(256, 128) + linear(128, 3)
-    assert count(net.field) == shape + colour == 583_172
+    assert count(net.field) == shape + colour == 714_756
     assert sum(p.numel() for p in net.code_parameters()) == 2 * 7 * 256
     # N(0, 2 / d): 3,584 draws hold the deviation to about 2.4 %, two standard errors
     assert float(net.shape_codes.detach().std()) == pytest.approx((2 / 256) ** 0.5, rel=0.05)

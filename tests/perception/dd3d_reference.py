@@ -6,6 +6,7 @@ See README.md of the folder that the fixture `dd3d_data` finds.
 import importlib.util
 import json
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,20 +15,22 @@ import torch
 
 from carstudio.geometry.camera import Camera
 from carstudio.images import read_image
-from carstudio.perception.dd3d.model import DD3D, Backbone, DD3DConfig
+from carstudio.perception.dd3d.model import Backbone
 
 SHORT_NAME: dict[Backbone, str] = {"dla34": "dla34", "v2-99": "v99"}
 FINEST_STRIDE: dict[Backbone, int] = {"dla34": 8, "v2-99": 4}
 
 
-def recipe_weights(folder: Path, backbone: Backbone) -> dict[str, torch.Tensor]:
-    """The recipe's weights in the order of the original's state dict, each with its checksum compared."""
+def recipe_weights(folder: Path, backbone: Backbone, constants: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """The recipe's weights in the order of the original's state dict, each with its checksum compared.
+
+    What the recipe does not make is taken from `constants`, a state dict of ours.
+    """
     spec = importlib.util.spec_from_file_location("dd3d_recipe", folder / "recipe.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    constants = DD3D(DD3DConfig(backbone)).state_dict()
     weights = {}
     for entry in json.loads((folder / f"keys_{SHORT_NAME[backbone]}.json").read_text()):
         value = module.recipe(entry["key"], entry["shape"], FINEST_STRIDE[backbone])

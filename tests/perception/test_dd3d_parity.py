@@ -52,7 +52,7 @@ EVERYTHING = Suppression(most_boxes=1_000_000)
 @torch.inference_mode()
 def test_it_equals_the_original(dd3d_data: Path, backbone: Backbone) -> None:
     network = DD3D(DD3DConfig(backbone)).eval()
-    weights = recipe_weights(dd3d_data, backbone)
+    weights = recipe_weights(dd3d_data, backbone, network.state_dict())
     assert list(network.state_dict()) == list(weights)
     network.load_state_dict(weights)
     reference = real_reference(dd3d_data, backbone)

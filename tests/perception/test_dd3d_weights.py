@@ -218,3 +218,33 @@ def test_the_whole_way_from_checkpoint_to_store(tmp_path: Path, capsys: pytest.C
     score_2d = math.sqrt(1 / (1 + math.exp(-6.0)) / (1 + math.exp(-5.0)))
     assert (joined.score_2d, joined.score_3d) == (0.8, pytest.approx(score_2d / (1 + math.exp(-2.0)), rel=1e-5))
     open_dd3d.cache_clear()
+
+
+def test_it_could_be_trained() -> None:
+    """Raw outputs are there before decoding, and gradients reach every parameter."""
+    torch.manual_seed(0)
+    network = DD3D(DD3DConfig("dla34")).train()
+    outputs = network(torch.randn(2, 3, 128, 128))
+    loss = torch.stack([getattr(level, name).square().mean() for level in outputs for name in vars(level)]).sum()
+    loss.backward()
+    for name, parameter in network.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+    moving = network.get_buffer("fcos2d_head.cls_tower.0.norm.0.running_mean")
+    frozen = network.get_buffer("fcos3d_head.box3d_tower.0.norm.0.running_mean")
+    assert float(moving.abs().max()) > 0 == float(frozen.abs().max())
+
+
+def test_photos_of_different_sizes_are_padded_to_one() -> None:
+    """Right and below, with what a mean pixel becomes: 0."""
+    network = DD3D(DD3DConfig("dla34"))
+    one = torch.full((3, 130, 100), 200, dtype=torch.uint8)
+    other = torch.zeros(3, 90, 300, dtype=torch.uint8)
+    pixels = network.prepare([one, other])
+    assert pixels.shape == (2, 3, 256, 384)  # multiples of 128
+    means, deviations = (103.53, 116.28, 123.675), (57.375, 57.12, 58.395)
+    for channel, (mean, deviation) in enumerate(zip(means, deviations, strict=True)):
+        assert pixels[0, channel, :130, :100].unique().tolist() == pytest.approx([(200 - mean) / deviation])
+        assert pixels[1, channel, :90, :300].unique().tolist() == pytest.approx([-mean / deviation])
+    assert float(pixels[0, :, 130:].abs().max()) == float(pixels[0, :, :, 100:].abs().max()) == 0
+    assert float(pixels[1, :, 90:].abs().max()) == float(pixels[1, :, :, 300:].abs().max()) == 0

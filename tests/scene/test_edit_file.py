@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from carstudio.errors import InputError
 from carstudio.scene.edit_file import parse_edits, read_edit_file, write_edits
+from carstudio.scene.edits import OPS
 
 GOOD = """\
 version: 1
@@ -61,6 +62,11 @@ def test_json_says_the_same() -> None:
 def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     write_edits(tmp_path / "e.yaml", parse_edits(GOOD, name="e"))
     assert [edit.model_dump() for edit in read_edit_file(tmp_path / "e.yaml")] == dumped(GOOD)
+
+
+def test_the_guides_edit_file_is_one(repo_root: Path) -> None:
+    text = (repo_root / "docs/edit_a_log.md").read_text().split("```yaml\n")[1].split("```")[0]
+    assert {edit.op for edit in parse_edits(text, name="edit_a_log.md")} == set(OPS)
 
 
 EDIT = "version: 1\nedits:\n  - op: move\n    track: 4\n"

@@ -284,6 +284,11 @@ def test_without_a_file_the_edit_is_named_by_number(cars: Cars) -> None:
         apply_edits(cars[0], edits, cars[1])
 
 
+def test_an_id_that_an_edit_took_away_is_unknown_to_the_next(cars: Cars) -> None:
+    with pytest.raises(InputError, match=r"edit 2 \(move\): no track '1'; .*tracks: 2, 3, 7"):
+        apply_edits(cars[0], [Delete(track="1"), Move(track="1", translation_m=(1, 0, 0))], cars[1])
+
+
 def test_warnings_name_what_looks_wrong(cars: Cars) -> None:
     def told(*edits: Edit) -> str:
         return "; ".join(apply_edits(cars[0], edits, cars[1]).warnings)

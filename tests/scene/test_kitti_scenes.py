@@ -7,20 +7,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 import carstudio.scene.lifting
 from carstudio.cli import run
+from carstudio.dataset.pixels import PreparedPatch, prepare_patch
 from carstudio.errors import InputError
 from carstudio.fitting.car_file import load_car
 from carstudio.fitting.optimise import FitConfig
+from carstudio.geometry.orbit import viewing_angles
 from carstudio.perception.grabcut import GrabCutSegmenter
 from carstudio.perception.results import MaskResult, SegmentRequest
 from carstudio.scene.kitti import Log, open_det_log, open_mot_log
-from carstudio.scene.lifting import LiftConfig, lift_tracks
+from carstudio.scene.lifting import LiftConfig, lift_tracks, mirrored_views
 from carstudio.scene.poses import lidar_and_imu, read_odometry_poses, read_oxts_poses
 from carstudio.scene.scene_file import load_scene
 from carstudio.scene.views import ViewConfig, rank_views
 from dataset.made_up_kitti import P2, made_up_kitti
+from training.toy import toy_record
 
 QUICK = LiftConfig(fit=FitConfig(steps=1), rays=16, views=ViewConfig(views=2, mask_ratio=-1.0))
 
@@ -188,6 +192,20 @@ def test_views_from_another_side_come_before_more_of_the_same(root: Path) -> Non
     boxes = {0: box, 1: replace(box, center=(0.0, box.center[1], 6.1)), 3: turned}
     ranked = rank_views(log.scene, replace(track, boxes=boxes), ViewConfig())
     assert [view.frame for view in ranked] == [0, 3, 1]
+
+
+def test_flipped_photographs_show_only_sides_that_none_shows() -> None:
+    def patch(azimuth_deg: float) -> PreparedPatch:
+        return replace(prepare_patch(toy_record(0, 0, azimuth_deg).decode(), 32), patch_id=str(azimuth_deg))
+
+    def side(patch: PreparedPatch) -> float:
+        return math.degrees(float(viewing_angles(patch.box)[0]))
+
+    found = mirrored_views([patch(60.0), patch(120.0)])
+    assert [round(side(each)) for each in found] == [-60, -120]
+    assert torch.equal(found[0].rgb, patch(60.0).rgb.flip(1))
+    assert mirrored_views([patch(180.0), patch(5.0)]) == []  # from behind and before both sides look alike
+    assert [round(side(each)) for each in mirrored_views([patch(60.0), patch(-50.0), patch(110.0)])] == [-110]
 
 
 def test_the_verb_makes_a_scene_and_says_what_is_in_it(

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from carstudio.commands.train import Train
 from carstudio.dataset.store import PatchStore
 from carstudio.errors import InputError
 from carstudio.models.code_nerf import CodeNeRFConfig
@@ -164,3 +165,12 @@ def test_the_occupancy_loss_is_autorfs_formula() -> None:
 def test_the_length_of_codes_is_euclids() -> None:
     latents = Latents(torch.tensor([[3.0, 4.0], [0.0, 0.0]]), torch.tensor([[0.0], [-2.0]]))
     assert float(code_length(latents)) == pytest.approx((5 + 0 + 0 + 2) / 2)
+
+
+def test_the_command_line_names_budget_and_optimiser(tmp_path: Path) -> None:
+    command = Train(recipe="car-gaussians", data=tmp_path, out=tmp_path, cpu_seconds=9.0, optimizer="adam")
+    assert (command.config().cpu_seconds, command.config().optimizer) == (9.0, "adam")
+    plain = Train(recipe="code-nerf", data=tmp_path, out=tmp_path).config()
+    assert (plain.cpu_seconds, plain.optimizer) == (None, "adamw")
+    with pytest.raises(InputError, match="give one"):
+        Train(recipe="car-nerf", data=tmp_path, out=tmp_path, cpu_seconds=9.0, minutes=1.0).config()

@@ -2,13 +2,12 @@
 
 import os
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
 import tyro
 
-from carstudio.commands.command import Outcome, Output, plain, provenance
+from carstudio.commands.command import Outcome, Output, provenance
 from carstudio.errors import InputError
 from carstudio.files import make_folder
 from carstudio.locks import FolderLock
@@ -19,6 +18,7 @@ from carstudio.scene.graph import Scene
 from carstudio.scene.random_edits import Traffic, random_traffic
 from carstudio.scene.scene_file import load_scene, save_scene
 from carstudio.scene.shelf import CarShelf, copy_cars
+from carstudio.scene.writing import write_edited
 
 SCENE = "scene"  # below the output: the edited scene, to look into or to edit further
 EDITS = "edits.yaml"
@@ -73,7 +73,6 @@ class Edit(Output):
         told = [f"  warning: {warning}" for warning in warnings]
         if self.dry_run:
             return Outcome("\n".join([f"{self.out / SCENE}: edited, nothing drawn", *told]), value)
-        write_edited = import_module("carstudio.scene.writing").write_edited
         with self.progress() as report:
             summary = write_edited(
                 original,
@@ -86,7 +85,7 @@ class Edit(Output):
                 provenance=provenance(),
             )
         text = f"{self.out}: {len(scene.frames)} frames; look at {self.out / 'index.html'}"
-        return Outcome("\n".join([text, *told]), {**value, "summary": plain(summary)})
+        return Outcome("\n".join([text, *told]), {**value, "frames": summary.num_frames, "kept": summary.kept})
 
     def _edit(self, scene: Scene) -> tuple[Scene, Edited, tuple[str, ...]]:
         """The scene as it was and as it is now, both with their cars below the output's own scene."""

@@ -18,6 +18,7 @@ from carstudio.dataset.store import PatchStore, open_store
 from carstudio.errors import InputError
 from carstudio.evaluation.tables import Table, to_markdown
 from carstudio.files import require_writable
+from carstudio.locks import FolderLock
 from carstudio.progress import Report
 from carstudio.signals import held_back_stops
 
@@ -92,7 +93,8 @@ class MakeTable(Output):
                 report=report,
                 should_stop=lambda: bool(stops),
             )
-            tables = self._make(work, budget)
+            with FolderLock(self.out):
+                tables = self._make(work, budget)
         text = "\n".join(to_markdown(table) for table in tables)
         files = [str(self.out / f"{self.name}.{ending}") for ending in ("md", "tex", "html")]
         return Outcome(f"{text}\n{', '.join(files)}", {"files": files, "tables": plain(tables)})

@@ -14,6 +14,7 @@ from carstudio.recipes import recipe
 from carstudio.report.panels import views_panel
 from carstudio.signals import held_back_stops
 from carstudio.training.batches import Supervision
+from carstudio.training.optimizers import OptimizerName
 from carstudio.training.resume import has_state, saved_step
 from carstudio.training.team import is_first_process
 from carstudio.training.trainer import TrainConfig, train
@@ -35,6 +36,8 @@ class Train(Output):
     """Length of the run in steps (the recipe's own when absent)."""
     minutes: float | None = None
     """Length of the run in minutes instead."""
+    cpu_seconds: float | None = None
+    """Length of the run in processor seconds instead, all processes together: what fair comparisons share."""
     device: str = "auto"
     """auto, cpu, cuda, cuda:1, mps, ..."""
     processes: Annotated[int, tyro.conf.arg(metavar="N")] = 1
@@ -53,12 +56,17 @@ class Train(Output):
     less for a short run from --init, which would otherwise forget what it started from)."""
     supervision: Supervision | None = None
     """Which photo an encoded photo must explain (the recipe's own when absent)."""
+    optimizer: OptimizerName | None = None
+    """radam (the paper's), adamw, or adam in one fused kernel (the recipe's own when absent)."""
     pictures: Annotated[int, tyro.conf.arg(metavar="N")] = 6
     """Cars in the picture drawn at every checkpoint; 0: none."""
 
     def config(self) -> TrainConfig:
         """The recipe with this command's changes."""
         config = replace(recipe(self.recipe), seed=self.seed, split=split_of(self.split), minutes=self.minutes)
+        if self.minutes is not None and self.cpu_seconds is not None:
+            raise InputError("--minutes and --cpu-seconds both say how long the run is; give one")
+        config = replace(config, cpu_seconds=self.cpu_seconds, optimizer=self.optimizer or config.optimizer)
         if self.steps is not None:
             config = replace(config, steps=self.steps)
         if self.supervision is not None:

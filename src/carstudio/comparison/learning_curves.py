@@ -269,11 +269,12 @@ def _pictures(found: Sequence[Curve], work: Work, marks: Sequence[int]) -> tuple
 
 def _marks(curve: Curve) -> list[int]:
     marks = sorted({score["fit_steps"] for score in curve.scores})
-    return [marks[0], marks[-1]] if len(marks) > 1 else marks
+    return [marks[0], marks[-1]] if len(marks) > 1 and curve.mode != FIELD else marks[-1:]
 
 
 def _times(curve: Curve) -> list[str]:
-    return ["before", f"+{curve.mode}"] if len(_marks(curve)) > 1 else [""]
+    after = {LATENTS: "+ latents", FIELD: "+ field", FIELD_ALONE: "+ field"}.get(curve.mode, "")
+    return ["before", after] if len(_marks(curve)) > 1 else [after]
 
 
 def _points(curve: Curve) -> list[Point]:

@@ -1,7 +1,7 @@
 """`zero-shot` and `multi-view`: the paper's Tables II and III, row by row, then the documents."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 from carstudio import __version__
@@ -52,6 +52,8 @@ def facts_of(work: Work, trained: Sequence[tuple[Row, dict[str, Any]]], budget: 
     parts = {part: work.store.patch_ids(split=work.split, part=part) for part in ("train", "test")}
     spent = sum(float(summary["cpu_seconds"]) for _, summary in trained)
     by_row = "; ".join(f"{row.name} {summary['steps']:,} / {summary['cpu_seconds']:,.0f}" for row, summary in trained)
+    own = [row.name for row, _ in trained if "sampling" not in {field.name for field in fields(row.config.model)}]
+    unlike = (("not alike", f"{', '.join(own)}: own encoder, batch, loss and schedule; equal in budget only"),)
     return (
         ("budget", str(budget)),
         ("data", f"{work.store.path.name}, sha256 {work.store.data_sha256[:16]}"),
@@ -59,5 +61,6 @@ def facts_of(work: Work, trained: Sequence[tuple[Row, dict[str, Any]]], budget: 
         ("scored", "all held-out photos" if work.limit is None else f"at most {work.limit} photos per protocol"),
         ("seed", str(work.seed)),
         ("cost", f"{spent:,.0f} CPU-seconds of training in all (steps / CPU-seconds: {by_row})"),
+        *(unlike if own else ()),
         ("made by", f"carstudio {__version__}: {work.command}"),
     )

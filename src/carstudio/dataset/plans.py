@@ -242,8 +242,8 @@ def input_places(config: BuildConfig) -> list[str | Path]:
         base = root if (root / images).is_dir() else root / "training"
         places = [base / images / (config.sequence or ""), base / labels, base / "calib"]
     specs = (config.detector, config.segmenter, config.box3d, config.camera)
-    named = [spec.partition(":")[2] for spec in specs if spec and ":" in spec]
-    return [*places, *(path for path in named if Path(path).exists())]
+    named = [Path(spec.partition(":")[2]).expanduser() for spec in specs if spec and ":" in spec]
+    return [*places, *(path for path in named if path.exists())]
 
 
 def uses_accelerator(config: BuildConfig) -> bool:

@@ -16,7 +16,7 @@ from carstudio.rendering.cones import Gaussians
 from carstudio.rendering.encoding import octaves, positional_encoding
 from carstudio.rendering.field import SamplingConfig
 
-SHAPE_BLOCKS, TEXTURE_BLOCKS = 2, 1  # of the authors' code for cars
+SHAPE_BLOCKS, TEXTURE_BLOCKS = 3, 1  # of the authors' settings for cars (srncar.json)
 
 
 @dataclass(frozen=True)
@@ -97,10 +97,11 @@ class CodeNeRFField(nn.Module):
         hidden = torch.relu(self.position_in(encode_points(points, self.config.position_frequencies)))
         for code_in, layer in zip(self.shape_in, self.shape_layers, strict=True):
             hidden = torch.relu(layer(hidden + torch.relu(code_in(shape))))
+        hidden = self.bottleneck(hidden)
         density = nn.functional.softplus(self.density(hidden).squeeze(-1).float())
         direction = encode_points(view_directions, self.config.direction_frequencies)[:, :, None]
         direction = direction.expand(*points.shape[:3], -1)
-        hidden = torch.relu(self.direction_in(torch.cat([self.bottleneck(hidden), direction], dim=-1)))
+        hidden = torch.relu(self.direction_in(torch.cat([hidden, direction], dim=-1)))
         for code_in, layer in zip(self.texture_in, self.texture_layers, strict=True):
             hidden = torch.relu(layer(hidden + torch.relu(code_in(texture))))
         colour = self.colour_out(torch.relu(self.colour_hidden(hidden)))
