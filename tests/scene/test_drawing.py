@@ -127,9 +127,10 @@ def test_a_deleted_car_is_filled_with_the_road_that_other_frames_show(tmp_path):
 
 def test_wrong_poses_cost_a_worse_fill_and_not_a_wrong_one(tmp_path):
     scene = toy_scene(tmp_path, frames=6, tracks={"1": [placed(0.0, 8.0 + 2.0 * i) for i in range(6)]})
-    turned = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
+    aside = np.eye(4)
+    aside[0, 3] = 1.5
     frames = tuple(
-        replace(f, world_from_camera=tuple(tuple(r) for r in (turned @ np.array(f.world_from_camera)).tolist()))
+        replace(f, world_from_camera=tuple(tuple(r) for r in (aside @ np.array(f.world_from_camera)).tolist()))
         if f.index
         else f
         for f in scene.frames

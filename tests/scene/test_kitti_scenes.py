@@ -19,11 +19,13 @@ from carstudio.geometry.orbit import viewing_angles
 from carstudio.perception.grabcut import GrabCutSegmenter
 from carstudio.perception.results import MaskResult, SegmentRequest
 from carstudio.scene.kitti import Log, open_det_log, open_mot_log
-from carstudio.scene.lifting import LiftConfig, lift_tracks, mirrored_views
+from carstudio.scene.lifting import LiftConfig, lift_tracks, mirrored_views, unseen_sides
 from carstudio.scene.poses import lidar_and_imu, read_odometry_poses, read_oxts_poses
 from carstudio.scene.scene_file import load_scene
 from carstudio.scene.views import ViewConfig, rank_views
+from carstudio.training.checkpoint import load_model
 from dataset.made_up_kitti import P2, made_up_kitti
+from scene.made_up_scene import made_up_car
 from training.toy import toy_record
 
 QUICK = LiftConfig(fit=FitConfig(steps=1), rays=16, views=ViewConfig(views=2, mask_ratio=-1.0))
@@ -206,6 +208,16 @@ def test_flipped_photographs_show_only_sides_that_none_shows() -> None:
     assert torch.equal(found[0].rgb, patch(60.0).rgb.flip(1))
     assert mirrored_views([patch(180.0), patch(5.0)]) == []  # from behind and before both sides look alike
     assert [round(side(each)) for each in mirrored_views([patch(60.0), patch(-50.0), patch(110.0)])] == [-110]
+
+
+def test_pictures_of_its_own_stand_in_for_sides_that_nothing_shows() -> None:
+    model, car = load_model("car-gaussians"), made_up_car(1)
+    seen = [prepare_patch(toy_record(0, 0, azimuth).decode(), 32) for azimuth in (0.0, 100.0)]
+    found = unseen_sides(model, car, seen)
+    sides = [round(math.degrees(float(viewing_angles(patch.box)[0]))) % 360 for patch in found]
+    assert sides == [180, 225, 270]  # 45 and 135 are within 50 degrees of what is seen, 315 of 0
+    assert all(patch.box.size.tolist() == pytest.approx(car.size) for patch in found)
+    assert all(50 < int((patch.mask == 255).sum()) for patch in found)
 
 
 def test_the_verb_makes_a_scene_and_says_what_is_in_it(

@@ -15,8 +15,9 @@ from carstudio.models.car_gaussians import CarGaussians
 from carstudio.models.interface import CategoryModel, Latents
 from carstudio.scene.graph import CarRef
 from carstudio.scene.lifting import patch_description
+from carstudio.scene.own_pictures import own_picture
 from carstudio.scene.paint import PaintView, body_colour, paint_share, painted, parse_colour, to_linear
-from carstudio.scene.recolour import PaintConfig, Way, _own_picture, mixed_texture, pictures_of, recolour_car
+from carstudio.scene.recolour import PaintConfig, Way, mixed_texture, pictures_of, recolour_car
 from carstudio.scene.recolour_measure import difference, recolour_truth, score_recolour
 from carstudio.scene.shelf import PATCH, PATCH_DESCRIPTION, PATCH_MASK, CarShelf
 from scene.made_up_scene import made_up_car
@@ -104,7 +105,7 @@ def test_the_papers_way_takes_the_photograph_that_lies_beside_the_car(shelf: Car
         own = CarShelf(tmp_path / name)
         own.take(shelf.folder("car-1"))
         car = own.load(own.ref("car-1"))
-        picture = _own_picture(own.model_of(car), car)
+        picture = own_picture(own.model_of(car), car, azimuth_deg=35.0)
         assert picture.box is not None
         write_png(own.folder("car-1") / PATCH, np.full_like(picture.image, grey))
         write_png(own.folder("car-1") / PATCH_MASK, picture.mask)

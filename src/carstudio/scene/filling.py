@@ -163,7 +163,7 @@ def _from_frames(
         if gain is None:
             continue
         taken = is_shown & left
-        colours = _sampled(photo, positions[taken]) * gain
+        colours = sampled_colours(photo, positions[taken]) * gain
         filled[wanted.rows[taken], wanted.columns[taken]] = np.clip(np.round(colours), 0, 255).astype(np.uint8)
         missing[wanted.rows[taken], wanted.columns[taken]] = False
         left &= ~taken
@@ -202,14 +202,14 @@ def _agreement(
     positions, is_shown = _places(around.world, other)
     if is_shown.sum() < 30:
         return None
-    theirs = _sampled(photo, positions[is_shown])
+    theirs = sampled_colours(photo, positions[is_shown])
     ours = image[around.rows[is_shown], around.columns[is_shown]].astype(np.float64)
     gain = np.clip(np.median(ours, axis=0) / np.maximum(np.median(theirs, axis=0), 1.0), 0.8, 1.25)
     wrong = float(np.median(np.abs(theirs * gain - ours).mean(axis=1)))
     return np.asarray(gain) if wrong <= _WRONG else None
 
 
-def _sampled(photo: Photograph, positions: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+def sampled_colours(photo: Photograph, positions: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
     """Colours between pixel centres (which lie at +0.5), bilinear."""
     x, y = (positions - 0.5).astype(np.float32).T
     # remap takes pictures with sides below 32,768: the points are laid out in rows

@@ -30,6 +30,7 @@ from carstudio.perception.results import PhotoSegmenter, Segmenter
 from carstudio.progress import Report, silent
 from carstudio.scene.graph import Scene, Track
 from carstudio.scene.kitti import Log
+from carstudio.scene.own_pictures import own_picture
 from carstudio.scene.shelf import PATCH, PATCH_DESCRIPTION, PATCH_MASK, CarShelf
 from carstudio.scene.views import ViewConfig, patches_of_track, psnr_on_car
 from carstudio.training.batches import stack_boxes
@@ -38,9 +39,9 @@ from carstudio.training.patch_fitting import fit_patches
 
 FIT_PICTURE = "fit.png"
 # A car is fitted to many photographs here, so its own copy of the field may follow them (Car-Studio section IV-C): on
-# KITTI's tracks 0001/3 and 0001/4 this gave 18.3 and 16.7 dB, the codes alone 15.8 and 12.8.
-SCENE_FIT = FitConfig(latent_rate=2e-2, field_rate=3e-4)
-_OTHER_SIDE_RAD = math.radians(30)
+# KITTI's track 0001/4 this gave 16.6 dB, the codes alone 12.8.
+SCENE_FIT = FitConfig(latent_rate=2e-2, field_rate=1e-2)
+_OTHER_SIDE_RAD, _UNSEEN_RAD = math.radians(30), math.radians(50)
 _KEY = "scene_key"  # of a car's provenance: the settings and photographs it was made from
 
 
@@ -120,17 +121,24 @@ def fit_track(model: CategoryModel, track: Track, records: Sequence[PatchRecord]
     """The car that explains all patches of a track best; its provenance says from which and how well."""
     patches = [prepare_patch(record.decode(), model.encoder_side_px) for record in records]
     shown = patches + (mirrored_views(patches) if config.mirrors else [])
-    fitted = fit_patches(model, shown, config.fit, rays=config.rays, seed=config.seed)
-    latents = Latents(fitted.latents.shape.cpu(), fitted.latents.texture.cpu())
+    codes_only = replace(config.fit, field_rate=0.0)
+    fitted = fit_patches(model, shown, codes_only, rays=config.rays, seed=config.seed)
     car = Car(
-        latents=latents,
+        latents=Latents(fitted.latents.shape.cpu(), fitted.latents.texture.cpu()),
         size=median_size(track),
         model_name=Path(config.model).name,
         model_sha256="",
         instance_id=records[0].instance_id,
         licence=records[0].licence,
-        weights={name: weight.cpu() for name, weight in fitted.weights.items()},
     )
+    if config.fit.field_rate:
+        shown = shown + unseen_sides(model, car, shown)
+        fitted = fit_patches(model, shown, config.fit, rays=config.rays, seed=config.seed)
+        car = replace(
+            car,
+            latents=Latents(fitted.latents.shape.cpu(), fitted.latents.texture.cpu()),
+            weights={name: weight.cpu() for name, weight in fitted.weights.items()},
+        )
     values = [value for value in (_psnr(model, car, patch) for patch in patches) if value is not None]
     provenance = {
         "patches": [record.patch_id for record in records],
@@ -153,6 +161,21 @@ def mirrored_views(patches: Sequence[PreparedPatch]) -> list[PreparedPatch]:
         return min(abs(math.remainder(side - other, 2 * math.pi)) for other in sides) > _OTHER_SIDE_RAD
 
     return [mirror_patch(patch) for patch, side in zip(patches, sides, strict=True) if is_new(-side)]
+
+
+def unseen_sides(model: CategoryModel, car: Car, patches: Sequence[PreparedPatch]) -> list[PreparedPatch]:
+    """The car's own pictures from sides that no patch shows, so that a field fitted to the others forgets none.
+
+    `car` is one whose codes alone were fitted: from there it looks as the model believes that such a car does.
+    """
+    sides = [float(viewing_angles(patch.box)[0]) for patch in patches]
+
+    def is_unseen(side: float) -> bool:
+        return min(abs(math.remainder(side - other, 2 * math.pi)) for other in sides) > _UNSEEN_RAD
+
+    angles = [angle for angle in range(0, 360, 45) if is_unseen(math.radians(angle))]
+    pictures = [own_picture(model, car, azimuth_deg=float(angle)) for angle in angles]
+    return [prepare_patch(picture, model.encoder_side_px) for picture in pictures]
 
 
 def median_size(track: Track) -> tuple[float, float, float]:

@@ -28,6 +28,7 @@ from carstudio.images import read_image
 from carstudio.models.interface import CategoryModel, Latents, render_image
 from carstudio.rendering.rays import Rays, image_positions, image_rays
 from carstudio.scene.graph import CarRef
+from carstudio.scene.own_pictures import own_picture
 from carstudio.scene.paint import PaintView, body_colour, paint_share, painted, parse_colour
 from carstudio.scene.shelf import PATCH, PATCH_DESCRIPTION, PATCH_MASK, CarShelf
 from carstudio.training.batches import generator_for, patch_batch, stack_boxes
@@ -102,7 +103,7 @@ def masked_texture(
 
     A car without a photograph beside it (made elsewhere) is encoded from its own picture.
     """
-    patch = _photograph(shelf, ref) or _own_picture(model, car)
+    patch = _photograph(shelf, ref) or own_picture(model, car, azimuth_deg=35.0)
     on_car = patch.mask == MaskValue.CAR
     image = patch.image.copy()
     tint = torch.tensor(colour).numpy() * 255
@@ -128,16 +129,6 @@ def _photograph(shelf: CarShelf, ref: CarRef) -> Patch | None:
     except (KeyError, TypeError, ValueError, AssertionError) as error:
         raise InputError(f"{folder / PATCH_DESCRIPTION}: not a patch's camera and box; make the scene again") from error
     return Patch(ref.name, ref.name, image, mask, None, camera, box)
-
-
-def _own_picture(model: CategoryModel, car: Car) -> Patch:
-    """A car's rendering from the front left, as if it were a photograph."""
-    box = around(car, 1, azimuth_deg=35.0)[0]
-    camera = orbit_camera(128)
-    found = render_image(model, camera.to(_device(model)), _latents(model, car), stack_boxes([box]).to(_device(model)))
-    rgb = (found["rgb"].cpu() * 255).round().to(torch.uint8).numpy()
-    mask = torch.where(found["opacity"].cpu() > _SOLID, int(MaskValue.CAR), int(MaskValue.BACKGROUND))
-    return Patch(car.instance_id, car.instance_id, rgb, mask.to(torch.uint8).numpy(), None, camera, box)
 
 
 def around(car: Car, views: int, *, azimuth_deg: float = 0.0) -> list[Box3D]:
