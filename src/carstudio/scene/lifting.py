@@ -4,6 +4,7 @@ One CAR per track, so that a car keeps its look wherever it is put. A finished c
 the same settings; a track that cannot be lifted stays without a car and its reason is told.
 """
 
+import copy
 import hashlib
 import json
 import math
@@ -20,7 +21,7 @@ from carstudio.dataset.patch import MaskValue, PatchRecord
 from carstudio.dataset.pixels import PreparedPatch, mirror_patch, prepare_patch
 from carstudio.errors import InputError
 from carstudio.files import read_json, write_bytes, write_json
-from carstudio.fitting.car_file import DESCRIPTION, Car, load_car, save_car
+from carstudio.fitting.car_file import DESCRIPTION, Car, load_car, put_weights, save_car
 from carstudio.fitting.optimise import FitConfig
 from carstudio.geometry.box3d import Box3D
 from carstudio.geometry.orbit import viewing_angles
@@ -198,10 +199,6 @@ def render_patch(model: CategoryModel, car: Car, patch: PreparedPatch) -> dict[s
 def _with_weights(model: CategoryModel, car: Car) -> CategoryModel:
     if not car.weights:
         return model
-    import copy
-
-    from carstudio.fitting.car_file import put_weights
-
     own = copy.deepcopy(model)
     put_weights(own, car, name=car.instance_id)
     return own

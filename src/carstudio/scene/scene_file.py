@@ -4,6 +4,7 @@ What the file says is checked before anybody uses it: format version, numbers, b
 folder.
 """
 
+import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
@@ -80,8 +81,6 @@ def check_scene(scene: Scene, *, name: str) -> None:
 
 def read_ref(scene: Scene, ref: FileRef, what: str, *, max_bytes: int = 2**30) -> bytes:
     """The bytes of a file of the log; `InputError` when it is gone or is not the one the scene was made from."""
-    import hashlib
-
     check_path(ref.path, name=what)
     data = read_bounded(Path(scene.root) / ref.path, what, max_bytes=max_bytes)
     if hashlib.sha256(data).hexdigest() != ref.sha256:
