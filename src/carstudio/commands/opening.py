@@ -5,8 +5,7 @@ from pathlib import Path
 from carstudio.errors import InputError
 from carstudio.fitting.car_file import Car, load_car, put_weights
 from carstudio.models.interface import CategoryModel
-from carstudio.training.bundled import bundled_models
-from carstudio.training.checkpoint import describe_model, load_model
+from carstudio.training.checkpoint import describe_model, folder_of_weights, load_model
 
 
 def open_car(folder: Path, run: Path | None) -> tuple[CategoryModel, Car]:
@@ -17,10 +16,7 @@ def open_car(folder: Path, run: Path | None) -> tuple[CategoryModel, Car]:
         raise InputError(
             f"{run}: not the model that {folder} was made with ({made_with}); fit the car again with this one"
         )
-    if run is None:
-        run = next(
-            (path for path in bundled_models().values() if describe_model(path).sha256 == car.model_sha256), None
-        )
+    run = run or folder_of_weights(car.model_sha256)
     if run is None:
         raise InputError(
             f"{folder}: made with the model {made_with}, which is not bundled; name its folder: --model RUN"

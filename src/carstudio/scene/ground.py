@@ -13,8 +13,8 @@ from jaxtyping import Float
 
 from carstudio.geometry.camera import Camera
 from carstudio.scene.graph import PlacedBox, Vector3
+from carstudio.scene.terrain import CAMERA_HEIGHT_M
 
-CAMERA_HEIGHT_M = 1.65  # of KITTI's cameras (Geiger et al., IJRR 2013, figure 3); most cars' windscreens are near it
 _STEEPEST = 0.2  # sine of the angle to the camera's y axis: 11 degrees, more than any road and any mounting
 _NEAR_ENOUGH_M = 0.1  # of a plane: LiDAR's noise and the road's camber
 _TRIES = 200

@@ -11,7 +11,7 @@ from carstudio.models.interface import CategoryModel
 from carstudio.scene.edit_file import nearest
 from carstudio.scene.graph import CarRef, Scene
 from carstudio.training.bundled import bundled_models
-from carstudio.training.checkpoint import describe_model, load_model
+from carstudio.training.checkpoint import folder_of_weights, load_model
 
 CARS = "cars"
 PATCH, PATCH_MASK, PATCH_DESCRIPTION = "patch.png", "patch_mask.png", "patch.json"
@@ -60,9 +60,9 @@ class CarShelf:
         return model
 
     def _model_folder(self, car: Car) -> Path:
-        for path in (*self.models, *bundled_models().values()):
-            if describe_model(path).sha256 == car.model_sha256:
-                return path
+        folder = folder_of_weights(car.model_sha256, self.models)
+        if folder is not None:
+            return folder
         raise InputError(
             f"car {car.instance_id!r}: made with the model {car.model_name} (weights {car.model_sha256[:16]}), which "
             "is not bundled; name its folder: --model RUN"

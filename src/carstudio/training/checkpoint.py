@@ -3,6 +3,7 @@
 `model.json` holds format version, model config, provenance and the sha256 of the weights beside it.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -154,3 +155,8 @@ def _check_names_and_shapes(expected: dict[str, torch.Tensor], tensors: dict[str
                 f"{name}: weights of another model: {key} has shape {list(tensor.shape)} of {tensor.dtype}, expected "
                 f"{list(expected[key].shape)} of {expected[key].dtype}"
             )
+
+
+def folder_of_weights(sha256: str, more: Iterable[Path] = ()) -> Path | None:
+    """The model with these weights among the folders of `more` and the bundled ones; None when it is not there."""
+    return next((path for path in (*more, *bundled_models().values()) if describe_model(path).sha256 == sha256), None)
