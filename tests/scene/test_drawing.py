@@ -1,6 +1,7 @@
 """Drawn frames: what no edit touches keeps its bytes, what it touches stays within old and new footprint and shadow."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from carstudio.errors import InputError
 from carstudio.scene.drawing import DrawnFrame, draw_frame, read_photo, render_frame
 from carstudio.scene.footprint import any_of, body_mask, ground_mask, outline_mask
-from carstudio.scene.frame_jobs import DrawingSettings, Sensor, frame_job
+from carstudio.scene.frame_jobs import DrawingSettings, Sensor, drawing_settings, frame_job
 from carstudio.scene.graph import Scene, Track
 from carstudio.scene.ground import find_ground
 from carstudio.scene.truth import bounding_box
@@ -238,3 +239,13 @@ def test_no_shadow_falls_on_what_is_no_ground(folder, scene, monkeypatch):
     frame = drawn(folder, scene, edited, depth_network="near")
     assert not frame.touched[55:, :75].any()
     assert frame.touched[55:, 76:].any()
+
+
+def test_depth_is_asked_for_by_name():
+    assert drawing_settings("fast") == DrawingSettings()
+    assert drawing_settings("fine", depth="ground") == DrawingSettings(rays_per_side=2, depth="ground")
+    named = drawing_settings("fast", depth="transformers:some/network", model=Path("run"))
+    assert (named.depth_network, named.model, named.depth) == ("some/network", "run", "auto")
+    for wrong in ("lidar", "transformers:", "onnx:x"):
+        with pytest.raises(InputError, match="--depth must be auto, ground or transformers:NAME_OR_FOLDER"):
+            drawing_settings("fast", depth=wrong)

@@ -1,7 +1,7 @@
 """`carstudio edit`: a scene and an edit file -> edited frames with depth, instance masks and labels."""
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,7 +13,7 @@ from carstudio.files import make_folder
 from carstudio.locks import FolderLock
 from carstudio.scene.edit_file import read_edit_file, write_edits
 from carstudio.scene.editing import Edited, apply_edits
-from carstudio.scene.frame_jobs import PRESETS
+from carstudio.scene.frame_jobs import drawing_settings
 from carstudio.scene.graph import Scene
 from carstudio.scene.random_edits import Traffic, random_traffic
 from carstudio.scene.scene_file import load_scene, save_scene
@@ -47,6 +47,9 @@ class Edit(Output):
     """Where the log lies now, when it has been moved since the scene was made."""
     preset: Literal["fast", "fine"] = "fast"
     """fast: one ray per pixel; fine: four, which is smoother at contours."""
+    depth: str = "auto"
+    """How far away the background is. auto: the log's own depth or LiDAR where it has one, else the ground;
+    transformers:NAME_OR_FOLDER: a monocular network's, made metric by LiDAR or the ground; ground: ground alone."""
     dry_run: bool = False
     """Write only the edited scene and tell what looks wrong; draw nothing."""
     workers: int = 0
@@ -62,7 +65,7 @@ class Edit(Output):
             raise InputError("expected either an edit file or --random N; see docs/edit_a_log.md")
         if self.workers < 0:
             raise InputError(f"--workers must be 0 (one per core) or more, found {self.workers}")
-        settings = replace(PRESETS[self.preset], model=None if self.model is None else str(self.model))
+        settings = drawing_settings(self.preset, depth=self.depth, model=self.model)
         scene = load_scene(self.scene, root=self.root)
         make_folder(self.out)
         with FolderLock(self.out / SCENE):

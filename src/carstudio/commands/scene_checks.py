@@ -10,7 +10,7 @@ from carstudio.commands.command import Outcome, Output, provenance
 from carstudio.errors import InputError
 from carstudio.evaluation.tables import to_markdown
 from carstudio.perception.specs import make_detector
-from carstudio.scene.frame_jobs import PRESETS
+from carstudio.scene.frame_jobs import drawing_settings
 from carstudio.scene.replay import replay, replay_table
 from carstudio.scene.scene_file import load_scene
 from carstudio.scene.simulation_gap import simulation_gap
@@ -29,6 +29,8 @@ class Replay(Output):
     """Where the log lies now, when it has moved."""
     preset: Literal["fast", "fine"] = "fast"
     """fast: a ray per pixel; fine: four."""
+    depth: str = "auto"
+    """How far away the background is: auto, ground or transformers:NAME_OR_FOLDER, as for `carstudio edit`."""
     workers: int = 1
     """Processes, a frame each."""
     detector: str | None = None
@@ -42,6 +44,7 @@ class Replay(Output):
         """Draw, score, and look through a detector's eyes when one is named."""
         scene = load_scene(self.scene, root=self.root)
         detector = None if self.detector is None else make_detector(self.detector)
+        settings = drawing_settings(self.preset, depth=self.depth)
         with self.progress() as report:
             scores = replay(
                 scene,
@@ -49,7 +52,7 @@ class Replay(Output):
                 self.out,
                 workers=self.workers,
                 report=report,
-                settings=PRESETS[self.preset],
+                settings=settings,
                 provenance=provenance(),
             )
             value = {"out": str(self.out), **asdict(scores)}

@@ -2,7 +2,8 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Literal
 
 from carstudio.errors import InputError
@@ -38,6 +39,19 @@ PRESETS = {
     "fast": DrawingSettings(),
     "fine": DrawingSettings(rays_per_side=2),
 }
+
+
+def drawing_settings(preset: str, *, depth: str = "auto", model: Path | None = None) -> DrawingSettings:
+    """A preset with the depth that is asked for: auto, ground, or transformers:NAME_OR_FOLDER (a monocular network)."""
+    settings = replace(PRESETS[preset], model=None if model is None else str(model))
+    kind, _, name = depth.partition(":")
+    if depth == "auto":
+        return settings
+    if depth == "ground":
+        return replace(settings, depth="ground")
+    if kind != "transformers" or not name:
+        raise InputError(f"--depth must be auto, ground or transformers:NAME_OR_FOLDER, found {depth!r}")
+    return replace(settings, depth_network=name)
 
 
 @dataclass(frozen=True, kw_only=True)
