@@ -86,6 +86,7 @@ def _shrunk(config: TrainConfig, budget: Budget) -> TrainConfig:
     fields = {field.name for field in dataclasses.fields(config.model)}
     if "sampling" not in fields:  # no radiance field: its own size, which is small already
         return config if budget.name != "smoke" else replace(config, patches_per_step=size.patches_per_step)
+    own: Any = config.model
     changes: dict[str, Any] = {
         "encoder": EncoderConfig(
             kind="small-pyramid",
@@ -93,7 +94,7 @@ def _shrunk(config: TrainConfig, budget: Budget) -> TrainConfig:
             pretrained=None,
             num_features=SMALL_PYRAMID_FEATURES,
         ),
-        "sampling": SamplingConfig(coarse=size.samples, fine=0),
+        "sampling": SamplingConfig(coarse=min(size.samples, own.sampling.coarse), fine=0),
         "width": size.width,
         "depth": (getattr(config.model, "depth", 0) + 1) // 2,
         "skip_after": None,

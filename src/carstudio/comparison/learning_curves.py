@@ -57,7 +57,7 @@ def fitted_rows() -> list[Row]:
 
 def scratch_rows() -> list[Row]:
     """NSG's object model, trained on the fitted photos alone."""
-    return [_row("nsg", "NSG (7 samples, place)"), _row("nsg-fair", "NSG, fair (64 samples)")]
+    return [_row("nsg", "NSG (7 samples, place)"), _row("nsg-fair", "NSG, fair (more samples, no place)")]
 
 
 def _row(name: str, title: str) -> Row:
