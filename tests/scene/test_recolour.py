@@ -197,3 +197,25 @@ def test_an_unknown_car_is_refused(shelf: CarShelf) -> None:
     with pytest.raises(InputError, match="expected a car"):
         recolour_car(shelf, CarRef("gone", "0" * 64), way="paint", colour=BLUE)
     assert load_car(shelf.folder("car-1")).instance_id == "made-up-1"
+
+
+def test_a_car_with_colours_of_its_own_is_painted_in_them_too(shelf: CarShelf) -> None:
+    """Weights fitted to the old paint would hold it: they move along, and nothing of the shape does."""
+    old = shelf.load(shelf.ref("car-1"))
+    model = shelf.model_of(old)
+    own = {name: value.detach().clone() for name, value in model.field_parameters()}
+    own["colour.colours.bias"] = own["colour.colours.bias"] + torch.tensor([1.5, -1.5, -1.5]).repeat(512)
+    shelf.add(replace(old, weights=own), "fitted")
+    config = QUICK
+    ref = recolour_car(shelf, shelf.ref("fitted"), way="paint", colour="#1030c0", config=config)
+    before, after = shelf.load(shelf.ref("fitted")), shelf.load(ref)
+    assert {name for name in own if not torch.equal(after.weights[name], before.weights[name])} == {
+        name for name in own if name.startswith("colour.")
+    }
+    truth = recolour_truth(shelf.model_of(before), before, parse_colour("#1030c0"), config)
+    found = score_recolour(truth, pictures_of(shelf.model_of(after), after, config))
+    code_alone = replace(after, weights=before.weights)
+    without = score_recolour(truth, pictures_of(shelf.model_of(code_alone), code_alone, config))
+    assert found.is_same_shape
+    assert found.paint_error < 0.5 * found.paint_error_before
+    assert found.paint_error < without.paint_error

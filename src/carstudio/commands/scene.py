@@ -184,10 +184,11 @@ class Recolour(Output):
         scores: dict[str, Any] = {}
         for way in ways:
             new = shelf.load(recolour_car(shelf, ref, way=way, colour=colour, other=other if way == "mix" else None))
-            pictures.append(pictures_of(model, new, config))
+            pictures.append(pictures_of(shelf.model_of(new), new, config))
             aim = truth
             if other is not None and way == "mix":
-                aim = recolour_truth(model, car, own_colour(model, shelf.load(other), config), config)
+                theirs = shelf.load(other)
+                aim = recolour_truth(model, car, own_colour(shelf.model_of(theirs), theirs, config), config)
             scores[way] = asdict(score_recolour(aim, pictures[-1]))
         write_png(self.out / "strip.png", strip(pictures, truth, config))
         return scores

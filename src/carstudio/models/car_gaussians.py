@@ -87,6 +87,10 @@ class CarGaussians(CategoryModel):
         own = {*template, "geometry.offsets.bias", "colour.colours.bias", "colour.tint.1.bias"}
         return [(name, parameter) for name, parameter in self.named_parameters() if name in own]
 
+    def colour_parameters(self) -> list[tuple[str, nn.Parameter]]:
+        """The last biases of the colour decoder."""
+        return [(name, parameter) for name, parameter in self.field_parameters() if name.startswith("colour.")]
+
     def encode(self, patches: PatchBatch) -> Latents:
         """Codes of shape and texture."""
         features = torch.cat([self.encoder(patches.image, patches.mask), pose_features(patches)], dim=-1)

@@ -99,6 +99,10 @@ class CategoryModel(nn.Module):
         codes = {id(parameter) for parameter in self.code_parameters()}
         return [(n, p) for n, p in self.named_parameters() if not n.startswith(encoding) and id(p) not in codes]
 
+    def colour_parameters(self) -> list[tuple[str, nn.Parameter]]:
+        """Those of `field_parameters` that change colours and nothing else; none where a model does not tell."""
+        return []
+
     def encode(self, patches: PatchBatch) -> Latents:
         """Latents of the cars in the patches."""
         raise NotImplementedError

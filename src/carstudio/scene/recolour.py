@@ -48,6 +48,7 @@ class PaintConfig:
     steps: int = 150
     rays: int = 1024
     rate: float = 0.03
+    weight_rate: float = 0.15  # of a car's own colour weights
     seed: int = 0
 
 
@@ -72,16 +73,24 @@ def recolour_car(
         return shelf.ref(name)
     car = shelf.load(ref)
     model = shelf.model_of(car)
+    weights: dict[str, Tensor] = {}
     if way == "mix":
         assert other is not None
-        texture = mixed_texture(car, shelf.load(other), 1.0 if amount is None else amount)
+        amount = 1.0 if amount is None else amount
+        texture = mixed_texture(car, shelf.load(other), amount)
+        weights = mixed_weights(model, shelf.model_of(shelf.load(other)), car, amount)
     elif way == "paper":
         assert colour is not None
         texture = masked_texture(model, car, parse_colour(colour), shelf, ref, 1 - TRANSPARENCY)
     else:
         assert colour is not None
-        texture = painted_texture(model, car, parse_colour(colour), config)
-    new = replace(car, latents=Latents(car.latents.shape, texture), provenance={**car.provenance, "recoloured": asked})
+        texture, weights = painted_look(model, car, parse_colour(colour), config)
+    new = replace(
+        car,
+        latents=Latents(car.latents.shape, texture),
+        weights={**car.weights, **weights},
+        provenance={**car.provenance, "recoloured": asked},
+    )
     return shelf.add(new, name)
 
 
@@ -93,6 +102,14 @@ def mixed_texture(car: Car, other: Car, amount: float) -> Float[Tensor, "1 code"
             f"{other.model_name}; fit both with one"
         )
     return torch.lerp(car.latents.texture, other.latents.texture, amount)
+
+
+@torch.no_grad()
+def mixed_weights(model: CategoryModel, other: CategoryModel, car: Car, amount: float) -> dict[str, Tensor]:
+    """`amount` of the other car's own colour weights, where this car has some of its own."""
+    theirs = dict(other.colour_parameters())
+    mine = [(name, value) for name, value in model.colour_parameters() if name in car.weights]
+    return {name: torch.lerp(value, theirs[name].to(value.device), amount).cpu() for name, value in mine}
 
 
 @torch.no_grad()
@@ -172,26 +189,35 @@ def pictures_of(model: CategoryModel, car: Car, config: PaintConfig) -> CarPictu
     return CarPictures(many, stack_boxes(boxes), PaintView(rgb.clamp(0, 1), place, is_car), opacity)
 
 
-def painted_texture(
+def painted_look(
     model: CategoryModel, car: Car, colour: Colour, config: PaintConfig | None = None
-) -> Float[Tensor, "1 code"]:
-    """The texture code whose pictures come nearest to the car's own with the paint exchanged."""
+) -> tuple[Float[Tensor, "1 code"], dict[str, Tensor]]:
+    """The texture code whose pictures come nearest to the car's own with the paint exchanged.
+
+    A car with colour weights of its own gets other ones too: they hold its old paint. `model` is the car's own then,
+    and is changed.
+    """
     config = config or PaintConfig()
     pictures = pictures_of(model, car, config)
     paint = body_colour(pictures.pixels)
     share = paint_share(pictures.pixels, paint)
     wanted = painted(pictures.pixels.rgb, share, paint, colour) * pictures.opacity[:, None]
     wanted = wanted.view(config.views, -1, 3).to(_device(model))
-    return _fit_texture(model, car, pictures, wanted, config)
+    return _fit_look(model, car, pictures, wanted, config)
 
 
-def _fit_texture(
+def _fit_look(
     model: CategoryModel, car: Car, pictures: CarPictures, wanted: Float[Tensor, "view ray 3"], config: PaintConfig
-) -> Float[Tensor, "1 code"]:
+) -> tuple[Float[Tensor, "1 code"], dict[str, Tensor]]:
     device = _device(model)
     latents = _latents(model, car)
     texture = latents.texture.clone().requires_grad_()
-    optimizer = torch.optim.Adam([texture], lr=config.rate)
+    weights = {name: value for name, value in model.colour_parameters() if name in car.weights}
+    moved = [texture, *weights.values()]
+    groups = [{"params": [texture], "lr": config.rate}]
+    if weights:
+        groups.append({"params": list(weights.values()), "lr": config.weight_rate})
+    optimizer = torch.optim.Adam(groups)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(config.steps, 1))
     rays, box = pictures.rays.to(device), pictures.box.to(device)
     solid = (pictures.opacity.view(config.views, -1) > 0.05).float()
@@ -203,11 +229,11 @@ def _fit_texture(
         some = Rays(*(_rows(value, picked) for value in (rays.origins, rays.directions, rays.radii)))
         found = model.render_levels(some, Latents(shape, texture.expand(config.views, -1)), box)[-1]
         loss = ((found.rgb - _rows(wanted, picked)) ** 2).mean()
-        (gradient,) = torch.autograd.grad(loss, [texture])
-        texture.grad = gradient
+        for value, gradient in zip(moved, torch.autograd.grad(loss, moved), strict=True):
+            value.grad = gradient
         optimizer.step()
         schedule.step()
-    return texture.detach().cpu()
+    return texture.detach().cpu(), {name: value.detach().clone().cpu() for name, value in weights.items()}
 
 
 def _rows(values: Tensor, picked: Tensor) -> Tensor:
