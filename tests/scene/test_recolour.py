@@ -219,3 +219,14 @@ def test_a_car_with_colours_of_its_own_is_painted_in_them_too(shelf: CarShelf) -
     assert found.is_same_shape
     assert found.paint_error < 0.5 * found.paint_error_before
     assert found.paint_error < without.paint_error
+
+
+def test_red_above_the_belt_line_is_paint_though_most_there_is_red() -> None:
+    """A bonnet and pillars that outnumber the windows must not save the paint from being exchanged."""
+    view = red_car()
+    above = torch.tensor([[0.6, 0.08, 0.08]] * 4), torch.tensor([[0.7, -0.3, 0.2]] * 4), torch.tensor([True] * 4)
+    parts = ((view.rgb, view.place, view.is_car), above)
+    more = PaintView(*(torch.cat(pair) for pair in zip(*parts, strict=True)))
+    share = paint_share(more, body_colour(more))
+    assert float(share[-4:].min()) > 0.5
+    assert torch.equal(share[:-4], paint_share(view, body_colour(view))), "windows stay windows"

@@ -98,13 +98,16 @@ def body_colour(view: PaintView) -> Float[Tensor, "3"]:
 def paint_share(view: PaintView, paint: Float[Tensor, "3"]) -> Float[Tensor, " pixel"]:
     """How much of each pixel is paint, 0 to 1.
 
-    On the body nearly everything is; between roof and belt line and at the ends only what has the paint's colour.
+    On the body nearly everything is; between roof and belt line and at the ends only what has the paint's colour. Where
+    paint without a hue looks like the windows, nothing between roof and belt line is taken: neither light nor hue tells
+    the two apart.
     """
     linear = to_linear(view.rgb)
     glass, ends = in_glass(view.place), view.place[:, 0].abs() > _ENDS
     share = torch.where(glass | ends, _likeness(linear, paint, 1.0), _likeness(linear, paint, _BODY))
     seen = view.is_car & glass
-    if bool(seen.any()):
+    has_hue = float((_chromaticity(paint) - 1 / 3).norm()) > _CHROMATICITY
+    if bool(seen.any()) and not has_hue:
         apart = (light_of(linear[seen]).median().clamp(min=1e-3).log() - light_of(paint).log()).abs()
         hue = (_chromaticity(linear[seen]).median(dim=0).values - _chromaticity(paint)).norm()
         if float(apart) < _DARK_APART and float(hue) < _CHROMATICITY:
