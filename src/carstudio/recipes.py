@@ -13,9 +13,9 @@ from carstudio.models.nsg import NSGConfig
 from carstudio.models.pixel_nerf import PixelNeRFConfig
 from carstudio.rendering.field import SamplingConfig
 from carstudio.rendering.gaussians.tracing import SplattingConfig
+from carstudio.training.config import TrainConfig
 from carstudio.training.losses import LossConfig
 from carstudio.training.schedule import ScheduleConfig
-from carstudio.training.trainer import TrainConfig
 
 
 def car_nerf() -> TrainConfig:

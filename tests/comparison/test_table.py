@@ -21,7 +21,7 @@ from carstudio.dataset.store import PatchStore
 from carstudio.errors import InputError
 from carstudio.evaluation.results import read_rows
 from carstudio.models.car_gaussians import CarGaussiansConfig
-from carstudio.training.trainer import TrainConfig
+from carstudio.training.config import TrainConfig
 from training.toy import TINY, toy_store
 
 TINIEST = Budget(

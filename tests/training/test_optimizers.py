@@ -16,11 +16,12 @@ from carstudio.models.zoo import build_model
 from carstudio.rendering.field import SamplingConfig
 from carstudio.training.batches import training_patches
 from carstudio.training.checkpoint import load_model
+from carstudio.training.config import TrainConfig
 from carstudio.training.log import read_log
 from carstudio.training.losses import LossConfig, code_length, mask_error
 from carstudio.training.optimizers import build_optimizer
 from carstudio.training.resume import load_state
-from carstudio.training.trainer import TrainConfig, train
+from carstudio.training.trainer import train
 from training.toy import TINY, toy_store
 
 CODED = dataclasses.replace(

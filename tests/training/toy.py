@@ -19,9 +19,9 @@ from carstudio.models.car_nerf import CarNeRFConfig
 from carstudio.models.encoders import EncoderConfig
 from carstudio.rendering.field import SamplingConfig
 from carstudio.rendering.rays import image_rays
+from carstudio.training.config import TrainConfig
 from carstudio.training.losses import LossConfig
 from carstudio.training.schedule import ScheduleConfig
-from carstudio.training.trainer import TrainConfig
 
 COLOURS = [((220, 40, 40), (40, 40, 220)), ((230, 200, 40), (40, 180, 60)), ((240, 240, 240), (60, 60, 60))]
 SIDE_PX = 40

@@ -14,10 +14,11 @@ from carstudio.recipes import recipe
 from carstudio.report.panels import views_panel
 from carstudio.signals import held_back_stops
 from carstudio.training.batches import Supervision
+from carstudio.training.config import TrainConfig
 from carstudio.training.optimizers import OptimizerName
 from carstudio.training.resume import has_state, saved_step
 from carstudio.training.team import is_first_process
-from carstudio.training.trainer import TrainConfig, train
+from carstudio.training.trainer import train
 
 
 @dataclass(frozen=True, kw_only=True)

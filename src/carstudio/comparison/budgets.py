@@ -10,8 +10,8 @@ from typing import Any, Literal
 
 from carstudio.models.encoders import SMALL_PYRAMID_FEATURES, EncoderConfig
 from carstudio.rendering.field import SamplingConfig
+from carstudio.training.config import TrainConfig
 from carstudio.training.schedule import ScheduleConfig
-from carstudio.training.trainer import TrainConfig
 
 BudgetName = Literal["smoke", "cpu", "gpu", "paper"]
 

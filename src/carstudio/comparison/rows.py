@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from carstudio.comparison.paper_figures import MULTI_VIEW, ZERO_SHOT, PaperFigures
 from carstudio.errors import InputError
 from carstudio.recipes import recipe
-from carstudio.training.trainer import TrainConfig
+from carstudio.training.config import TrainConfig
 
 SPLITS = {"zero-shot": "instance", "multi-view": "view", "scaling": "instance", "ttopt": "instance"}
 

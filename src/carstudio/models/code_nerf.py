@@ -46,9 +46,7 @@ class CodeNeRF(FieldModel):
         super().__init__()
         self.config = config
         self.sampling = config.sampling
-        count, scale = max(1, len(config.cars)), (2 / config.code_size) ** 0.5
-        self.shape_codes = nn.Parameter(torch.randn(count, config.code_size) * scale)
-        self.texture_codes = nn.Parameter(torch.randn(count, config.code_size) * scale)
+        self.shape_codes, self.texture_codes = (new_codes(config.cars, config.code_size) for _ in range(2))
         self.field = CodeNeRFField(config)
 
     def code_parameters(self) -> tuple[nn.Parameter, ...]:
@@ -106,6 +104,11 @@ class CodeNeRFField(nn.Module):
             hidden = torch.relu(layer(hidden + torch.relu(code_in(texture))))
         colour = self.colour_out(torch.relu(self.colour_hidden(hidden)))
         return density, torch.sigmoid(colour.float())
+
+
+def new_codes(cars: tuple[str, ...], size: int) -> nn.Parameter:
+    """A random row per car (one, where there is none yet)."""
+    return nn.Parameter(torch.randn(max(1, len(cars)), size) * (2 / size) ** 0.5)
 
 
 def codes_of(

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from carstudio.geometry.box3d import Box3D
-from carstudio.models.code_nerf import codes_of, encode_points
+from carstudio.models.code_nerf import codes_of, encode_points, new_codes
 from carstudio.models.field_model import FieldModel
 from carstudio.models.interface import Latents, PatchBatch
 from carstudio.rendering.cones import Gaussians
@@ -56,8 +56,7 @@ class NSG(FieldModel):
         super().__init__()
         self.config = config
         self.sampling = config.sampling
-        count, scale = max(1, len(config.cars)), (2 / config.code_size) ** 0.5
-        self.codes = nn.Parameter(torch.randn(count, config.code_size) * scale)
+        self.codes = new_codes(config.cars, config.code_size)
         self.field = NSGField(config)
 
     def code_parameters(self) -> tuple[nn.Parameter, ...]:

@@ -4,7 +4,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,69 +17,20 @@ from carstudio.devices import pick_device
 from carstudio.errors import InputError, Interrupted
 from carstudio.files import remove_partials
 from carstudio.locks import LOCK_NAME, FolderLock
-from carstudio.models.car_nerf import CarNeRFConfig
 from carstudio.models.interface import CategoryModel
-from carstudio.models.zoo import ModelConfig, build_model, with_cars
+from carstudio.models.zoo import build_model, with_cars
 from carstudio.progress import Report, silent
 from carstudio.rendering.rays import to_canonical
-from carstudio.training.batches import Mirroring, StepSampler, Supervision, generator_for, training_patches
+from carstudio.training.batches import StepSampler, generator_for, training_patches
 from carstudio.training.checkpoint import describe_model, load_weights_of, save_model
+from carstudio.training.config import TrainConfig
 from carstudio.training.log import LOG, TrainingLog
-from carstudio.training.losses import LossConfig, code_length, masked_psnr, training_loss
-from carstudio.training.optimizers import OptimizerName, build_optimizer
-from carstudio.training.precision import Precision, autocast, resolve_precision
+from carstudio.training.losses import code_length, masked_psnr, training_loss
+from carstudio.training.optimizers import build_optimizer
+from carstudio.training.precision import autocast, resolve_precision
 from carstudio.training.resume import STATE, TrainingState, load_state, save_state
-from carstudio.training.schedule import ScheduleConfig, learning_rate
+from carstudio.training.schedule import learning_rate
 from carstudio.training.team import Team, team_of, torchrun_device
-
-
-@dataclass(frozen=True)
-class TrainConfig:
-    """Everything that decides a run, data aside; the defaults are the paper's (3 x 1,024 pixels, RAdam)."""
-
-    recipe: str = "car-nerf"
-    """Name of the recipe it came from; rows and tables call the model by it."""
-    model: ModelConfig = field(default_factory=CarNeRFConfig)
-    """The model."""
-    loss: LossConfig = field(default_factory=LossConfig)
-    """Terms of the loss."""
-    schedule: ScheduleConfig = field(default_factory=ScheduleConfig)
-    """Learning rate."""
-    supervision: Supervision = "single-view"
-    """Which photo of the car an encoded photo must explain."""
-    mirroring: Mirroring = "off"
-    """Whether photos are flipped left to right half of the time: never, input and explained photo alike, or each."""
-    patches_per_step: int = 3
-    """Cars encoded per step."""
-    rays_per_patch: int = 1024
-    """Pixels per patch and step."""
-    steps: int = 500_000
-    """Length of the run."""
-    minutes: float | None = None
-    """Stop after this much time instead, and let the learning rate follow the clock."""
-    cpu_seconds: float | None = None
-    """Stop after so many processor seconds instead, those of all processes of a team together; the learning rate
-    follows them. What rows of a table have in common."""
-    optimizer: OptimizerName = "radam"
-    """radam: the paper's; adamw: CodeNeRF's; adam: one fused kernel, the least work per step."""
-    code_rate: float = 1.0
-    """Learning rate of codes that are kept per car (CodeNeRF), as a multiple of the schedule's."""
-    most_cars: int | None = None
-    """Train on so many of the split's cars only; fewer are always among the more. None: on all."""
-    least_views: int = 1
-    """Leave out cars with fewer photos in the training part (the paper's multi-view comparison: 2)."""
-    clip_gradient: float | None = None
-    """Largest gradient norm; None: not clipped, as released."""
-    precision: Precision = "float32"
-    """Number format of matrix products; "auto": bfloat16 where the device has matrix units for it."""
-    seed: int = 0
-    """Start of all randomness."""
-    split: str | None = "instance"
-    """Split whose training part is used; None: all kept patches."""
-    log_every: int = 20
-    """Steps per line of log.jsonl."""
-    save_every: int = 500
-    """Steps between checkpoints."""
 
 
 @dataclass(frozen=True)
