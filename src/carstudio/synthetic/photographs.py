@@ -4,7 +4,7 @@ A `Renderer` makes the colours: the ray caster, by the mean of 2 x 2 rays to a p
 always those of the exact ray through a pixel's centre: it is "car" exactly when its centre is (no majority vote).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -113,6 +113,16 @@ def draw_azimuths(rng: np.random.Generator, num: int) -> Float[np.ndarray, " n"]
     return rng.permutation((np.arange(num) + rng.random(num)) / num + rng.random()) % 1 * 2 * np.pi
 
 
+@dataclass(frozen=True)
+class Shot:
+    """All that a photograph is developed from; `rng` draws the sensor's noise."""
+
+    viewpoint: Viewpoint
+    sensor: Sensor
+    radiance: Radiance
+    rng: np.random.Generator
+
+
 def draw_photographs(
     car: Car,
     *,
@@ -127,15 +137,28 @@ def draw_photographs(
     Cameras, light and truth are the same for every renderer (the ray caster by default).
     """
     scene = draw_scene(car, np.random.default_rng([*seed, 1]))
+    shots = draw_shots(car, scene, seed=seed, num_views=num_views, size_px=size_px, cameras=cameras, renderer=renderer)
+    return [take_photograph(scene, shot.viewpoint, shot.sensor, shot.rng, shot.radiance) for shot in shots]
+
+
+def draw_shots(
+    car: Car,
+    scene: Scene,
+    *,
+    seed: tuple[int, ...],
+    num_views: int,
+    size_px: int,
+    cameras: CameraKind,
+    renderer: Renderer | None = None,
+) -> Iterator[Shot]:
+    """What `draw_photographs` develops, one view after the other."""
     render = (renderer or RayCaster()).prepare(scene)
     azimuths = draw_azimuths(np.random.default_rng([*seed, 2]), num_views)
-    photographs = []
     for view in range(num_views):
         rng = np.random.default_rng([*seed, 3, view])
         viewpoint = draw_viewpoint(rng, car.mesh, kind=cameras, azimuth_rad=float(azimuths[view]), size_px=size_px)
         sensor, noise = draw_sensor(rng), np.random.default_rng([*seed, 4, view]).integers(2**30)
-        photographs.append(take_photograph(scene, viewpoint, sensor, rng, render(viewpoint, int(noise))))
-    return photographs
+        yield Shot(viewpoint, sensor, render(viewpoint, int(noise)), rng)
 
 
 def picture(
