@@ -67,7 +67,7 @@ def car_gaussians() -> TrainConfig:
     return TrainConfig(
         recipe="car-gaussians",
         model=CarGaussiansConfig(),
-        loss=LossConfig(colour="whole-crop", mask_weight=0.3, exposed_share=0.5),
+        loss=LossConfig(colour="whole-crop", mask_weight=0.3, exposed_share=0.5, photo_error="log"),
         schedule=ScheduleConfig(first=5e-3, last=1e-4, decay_steps=None, warmup_steps=100),
         supervision="mixed",
         mirroring="together",

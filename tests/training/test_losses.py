@@ -1,8 +1,19 @@
+import math
+
 import pytest
 import torch
 
 from carstudio.rendering.volume import Rendering
-from carstudio.training.losses import LossConfig, best_gain, colour_error, masked_psnr, training_loss
+from carstudio.training.losses import (
+    LEAST_ERROR,
+    USUAL_ERROR,
+    LossConfig,
+    best_gain,
+    colour_error,
+    masked_psnr,
+    over_photos,
+    training_loss,
+)
 
 
 def rendering(rgb: torch.Tensor, opacity: torch.Tensor) -> Rendering:
@@ -34,6 +45,34 @@ def test_loss_equals_the_papers_equations_in_a_loop(colour: str) -> None:
     terms = training_loss(levels, rgb, alpha, counts, LossConfig(colour=colour))  # type: ignore[arg-type]
     assert float(sum(terms.values())) == pytest.approx(total, rel=1e-5)
     assert set(terms) == {"colour_coarse", "mask_coarse", "colour_fine", "mask_fine"}
+
+
+def test_the_logarithm_of_a_photos_error_is_its_psnr_on_another_scale() -> None:
+    """Far above the least error, ten times the error costs the same from anywhere: 10 dB."""
+    errors = torch.tensor([[0.2, 0.4], [2.0, 4.0], [20.0, 40.0]], dtype=torch.float64)
+    share = torch.full((1, 2), 0.5, dtype=torch.float64)
+    costs = [float(over_photos(row[None], share, "log")) for row in errors]
+    expected = USUAL_ERROR * torch.log(torch.tensor(10.0, dtype=torch.float64))
+    assert costs[1] - costs[0] == pytest.approx(float(expected), rel=2e-2)
+    assert costs[2] - costs[1] == pytest.approx(float(expected), rel=2e-3)
+
+
+def test_the_logarithm_is_taken_per_photo_by_what_counts_of_it() -> None:
+    """Against a loop; the second photo has three of the eight rays that count."""
+    levels, rgb, alpha, counts = random_case()
+    config = LossConfig(colour="whole-crop", photo_error="log")
+    expected = 0.0
+    for photo in range(2):
+        seen = [
+            float(((levels[-1].rgb[photo, r] - alpha[photo, r] * rgb[photo, r]) ** 2).mean())
+            for r in range(5)
+            if counts[photo, r]
+        ]
+        if seen:
+            expected += len(seen) / int(counts.sum()) * USUAL_ERROR * math.log(1 + sum(seen) / len(seen) / LEAST_ERROR)
+    assert float(training_loss(levels, rgb, alpha, counts, config)["colour_fine"]) == pytest.approx(expected, rel=1e-5)
+    none = training_loss(levels, rgb, alpha, torch.zeros_like(counts), config)["colour_fine"]
+    assert float(none) == 0.0
 
 
 def test_masked_out_pixels_have_exactly_zero_colour_gradient() -> None:

@@ -13,6 +13,8 @@ from torch import Tensor
 from carstudio.models.interface import Latents
 from carstudio.rendering.volume import Rendering
 
+USUAL_ERROR, LEAST_ERROR = 0.01, 0.002  # squared colour errors of photos: 20 dB and 27 dB
+
 
 @dataclass(frozen=True)
 class LossConfig:
@@ -29,6 +31,9 @@ class LossConfig:
     exposed_share: float = 0.0
     """Share of the colour term that is taken after the gain that suits each photo best (not in the paper): exposure is
     a camera's whim, and a model that follows it learns details later."""
+    photo_error: Literal["mean", "log"] = "mean"
+    """How a photo's mean squared colour error counts: "mean": as it is (Eq. 6); "log": its logarithm, as in PSNR, so
+    that dark cars, whose errors are small, are learned as well as bright ones (not in the paper)."""
     coarse_weight: float = 0.1
     """lambda_c of Eq. 6-7 (released: 0.1)."""
 
@@ -49,16 +54,31 @@ def training_loss(
     for level, rendering in enumerate(levels):
         is_last = level == len(levels) - 1
         name, weight = ("fine", 1.0) if is_last else ("coarse", config.coarse_weight)
-        plain = (share * colour_error(rendering.rgb, rgb, alpha, config.colour)).sum()
+        plain = over_photos(colour_error(rendering.rgb, rgb, alpha, config.colour), share, config.photo_error)
         if config.exposed_share:
             gain = best_gain(rendering.rgb, rgb, alpha * counts)
-            exposed = (share * colour_error(rendering.rgb * gain, rgb, alpha, config.colour)).sum()
-            plain = plain + config.exposed_share * (exposed - plain)
+            error = colour_error(rendering.rgb * gain, rgb, alpha, config.colour)
+            plain = plain + config.exposed_share * (over_photos(error, share, config.photo_error) - plain)
         terms[f"colour_{name}"] = weight * plain
         if config.mask_weight:
             error = mask_error(rendering.opacity, alpha, config.mask_error)
             terms[f"mask_{name}"] = weight * config.mask_weight * (share * error).sum()
     return terms
+
+
+def over_photos(
+    error: Float[Tensor, "batch ray"], share: Float[Tensor, "batch ray"], kind: Literal["mean", "log"]
+) -> Float[Tensor, ""]:
+    """One number of the errors of rays whose shares sum to 1 (or are all 0): their mean, or a mean of logarithms.
+
+    A photo with mean error e counts with USUAL_ERROR log(1 + e / LEAST_ERROR): its slope is near 1 where e is usual and
+    falls as 1 / e above, so that a decibel of one photo is worth as much as that of another.
+    """
+    if kind == "mean":
+        return (share * error).sum()
+    of_photo = share.sum(dim=-1)
+    mean = (share * error).sum(dim=-1) / of_photo.clamp(min=1e-12)
+    return (of_photo * USUAL_ERROR * torch.log1p(mean / LEAST_ERROR)).sum()
 
 
 def best_gain(
