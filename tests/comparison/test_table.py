@@ -247,6 +247,14 @@ def test_the_paper_budget_is_the_papers() -> None:
     assert [row.config.supervision for row in multi_view_rows()][3:5] == ["multi-view", "single-view"]
 
 
+def test_small_rows_may_share_steps_instead_of_processor_seconds() -> None:
+    budget = replace(BUDGETS["cpu"], steps=7, cpu_seconds=None)
+    config = within(budget, zero_shot_rows()[0].config)
+    assert (config.steps, config.cpu_seconds, config.minutes) == (7, None, None)
+    assert config.model == first().model
+    assert str(budget).startswith("cpu: 7 steps of training per row")
+
+
 def test_unknown_rows_and_lengths_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(InputError, match="no row \\['car'\\]; there are pixelnerf-resnet"):
         chosen(zero_shot_rows(), ("car",))
@@ -254,7 +262,7 @@ def test_unknown_rows_and_lengths_are_refused(tmp_path: Path, capsys: pytest.Cap
     for options, message in (
         (["--budget", "cpu"], "--data STORE is needed"),
         (["--budget", "smoke", "--cpu-seconds", "3"], "goes with --budget cpu"),
-        (["--budget", "cpu", "--steps", "3"], "does not go with --budget cpu"),
+        (["--budget", "cpu", "--steps", "3", "--cpu-seconds", "3"], "found both"),
     ):
         assert run(["table", "zero-shot", "--out", out, *options]) == 2
         assert message in capsys.readouterr().err

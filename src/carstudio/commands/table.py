@@ -49,7 +49,8 @@ class MakeTable(Output):
     cpu_seconds: float | None = None
     """Budget cpu: processor seconds of training per row (300)."""
     steps: int | None = None
-    """Other budgets: training steps per row."""
+    """Training steps per row, with budget cpu instead of processor seconds (for `scaling`: photos of many cars take
+    longer to decode, so rows of equal time make unequal steps)."""
     rows: tuple[str, ...] = ()
     """Names of the rows; the paper's and car-gaussians when absent."""
     limit: int | None = None
@@ -73,9 +74,9 @@ class MakeTable(Output):
                 raise InputError(f"--cpu-seconds goes with --budget cpu, found --budget {self.budget}; give --steps")
             budget = replace(budget, cpu_seconds=self.cpu_seconds)
         if self.steps is not None:
-            if budget.steps is None:
-                raise InputError("--steps does not go with --budget cpu: its rows share processor seconds")
-            budget = replace(budget, steps=self.steps)
+            if self.cpu_seconds is not None:
+                raise InputError("rows share either --steps or --cpu-seconds, found both")
+            budget = replace(budget, steps=self.steps, cpu_seconds=None)
         budget = replace(budget, scored=self.limit if self.limit is not None else budget.scored)
         if self.fit_data is not None and self.name != "ttopt":
             raise InputError(f"--fit-data goes with `table ttopt`, found `table {self.name}`")
