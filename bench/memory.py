@@ -29,10 +29,13 @@ class StepMemory:
 
 
 def step_memory(name: str, rays_per_patch: int, device: str) -> StepMemory:
-    """Of a recipe, by two fresh processes."""
-    patches = recipe(name).patches_per_step
-    once, twice = (_in_a_process(name, rays, device) for rays in (rays_per_patch, 2 * rays_per_patch))
-    return StepMemory(once / 2**20, max(twice - once, 1) / 2**10 / (patches * rays_per_patch))
+    """Of a recipe; rays are doubled until they are a third of a step's memory, for less hides behind other peaks."""
+    patches, rays = recipe(name).patches_per_step, rays_per_patch
+    first = once = _in_a_process(name, rays, device)
+    twice = _in_a_process(name, 2 * rays, device)
+    while twice - once < twice / 3 and rays < 16 * rays_per_patch:
+        rays, once, twice = 2 * rays, twice, _in_a_process(name, 4 * rays, device)
+    return StepMemory(first / 2**20, max(twice - once, 1) / 2**10 / (patches * rays))
 
 
 def _in_a_process(name: str, rays_per_patch: int, device: str) -> int:
