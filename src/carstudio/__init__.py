@@ -7,14 +7,16 @@ __version__ = "0.1.0"
 
 # Public name -> module that defines it; loaded on first use, so that `import carstudio` stays quick.
 _HOMES = {
+    "BakedCar": "carstudio.models.baked",
     "Camera": "carstudio.geometry.camera",
     "Box3D": "carstudio.geometry.box3d",
     "InputError": "carstudio.errors",
     "Scene": "carstudio.scene.graph",
+    "bake": "carstudio.models.baked",
     "load_model": "carstudio.training.checkpoint",
     "open_store": "carstudio.dataset.store",
 }
-__all__ = ["Box3D", "Camera", "InputError", "Scene", "load_model", "open_store"]
+__all__ = ["BakedCar", "Box3D", "Camera", "InputError", "Scene", "bake", "load_model", "open_store"]
 
 
 def __getattr__(name: str) -> Any:

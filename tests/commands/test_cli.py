@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import torch
 
+import carstudio
 import carstudio.training.trainer
 from carstudio.cli import VERBS, run
 from carstudio.errors import Interrupted, StorageError
@@ -106,6 +107,17 @@ def test_render_goes_round_the_car(trained: Path) -> None:
     assert b"ftyp" in (out / "toy-0-0" / "turntable.mp4").read_bytes()[:12]
 
 
+def test_a_preview_is_nearly_the_picture(tmp_path: Path) -> None:
+    car = str(Path(carstudio.__file__).parent / "bundled" / "suv-red")
+    for name, more in (("full", []), ("preview", ["--preview"])):
+        command = ["render", car, "--out", str(tmp_path / name), "--views", "2", "--size", "96", "--device", "cpu"]
+        assert run([*command, *more]) == 0
+    for kind in ("rgb", "opacity", "depth"):
+        pair = [read_image(tmp_path / name / kind / "001.png").astype(float) for name in ("full", "preview")]
+        assert pair[0].shape == pair[1].shape
+        assert 0 < abs(pair[0] - pair[1]).mean() < 2.5, kind
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -120,6 +132,7 @@ def test_render_goes_round_the_car(trained: Path) -> None:
         ),
         (["render", "RUN", "--data", "DATA", "--out", "OUT", "--patches", "toy-9-9"], "toy-9-9"),
         (["render", "RUN", "--data", "DATA", "--out", "OUT", "--size", "0"], "--size"),
+        (["render", "RUN", "--data", "DATA", "--out", "OUT", "--patches", "toy-0-0", "--preview"], "--preview"),
         (["dataset", "info", "NOWHERE"], "NOWHERE"),
         (["build", "kitti-mot", "--root", "NOWHERE", "--out", "OUT"], "NOWHERE"),
     ],

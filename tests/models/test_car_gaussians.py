@@ -1,6 +1,7 @@
 """The Gaussian model: what codes may change, where the photo is looked up, symmetry, training and files."""
 
 import dataclasses
+import math
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,8 @@ from carstudio.recipes import RECIPES, recipe
 from carstudio.rendering.rays import image_rays, to_canonical
 from carstudio.rendering.volume import composite
 from carstudio.training.checkpoint import load_model, save_model
+from carstudio.training.log import read_log
+from carstudio.training.schedule import ScheduleConfig
 from carstudio.training.trainer import train
 from training.toy import TINY, toy_store
 
@@ -131,6 +134,23 @@ def test_it_learns_the_toy_cars(store: PatchStore, tmp_path: Path) -> None:
     views = list(score_views(model, store, view_pairs(store, EvaluationConfig(protocol="novel-view", split=None))))
     assert sum(view.scores.mask_iou or 0 for view in views) / len(views) > 0.85
     assert sum(view.scores.psnr or 0 for view in views) / len(views) > 17.0
+
+
+def test_4096_gaussians_learn_too(store: PatchStore, tmp_path: Path) -> None:
+    """Eight times the recipe's number: the loss falls, everything stays finite, a picture comes out."""
+    model = dataclasses.replace(SMALL, num_splats=4096)
+    rate = ScheduleConfig(first=5e-3, last=1e-3, decay_steps=None)
+    config = dataclasses.replace(TOY, model=model, schedule=rate, steps=30, save_every=30, log_every=5)
+    train(config, store, tmp_path / "run", device="cpu")
+    losses = [row["loss"] for row in read_log(tmp_path / "run" / "log.jsonl")]
+    assert all(math.isfinite(loss) for loss in losses)
+    assert losses[-1] < 0.9 * losses[0], losses
+    trained = load_model(tmp_path / "run")
+    assert all(bool(parameter.isfinite().all()) for parameter in trained.parameters())
+    patches = batch(1, side=trained.encoder_side_px)
+    with torch.no_grad():
+        image = render_image(trained, orbit_camera(32), trained.encode(patches), patches.box)
+    assert float(image["opacity"].max()) > 0.9
 
 
 class KilledError(Exception):

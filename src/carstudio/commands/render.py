@@ -16,7 +16,7 @@ from carstudio.files import inside
 from carstudio.fitting.car_file import DESCRIPTION
 from carstudio.geometry.box3d import Box3D
 from carstudio.images import write_png
-from carstudio.models.interface import Latents
+from carstudio.models.interface import CategoryModel, Latents
 from carstudio.report.panels import Turntable, encode_patch, turntable
 from carstudio.report.video import write_gif, write_mp4
 from carstudio.training.checkpoint import load_model
@@ -46,6 +46,9 @@ class Render(Output):
     """Side of a view in px."""
     elevation: float = 12.0
     """Height angle of the camera in degrees."""
+    preview: bool = False
+    """Bake the car into its Gaussians first and draw those sorted by tiles of pixels instead of rays: several times as
+    fast on a CPU, nearly the same pictures; for models made of Gaussians (car-gaussians)."""
     device: str = "auto"
     """auto, cpu, cuda, mps, ..."""
 
@@ -67,9 +70,7 @@ class Render(Output):
         with self.progress() as report:
             for done, patch_id in enumerate(patch_ids, start=1):
                 prepared, latents, box = encode_patch(model, store, patch_id)
-                frames = turntable(
-                    model, latents, box, views=self.views, size_px=self.size, elevation_deg=self.elevation
-                )
+                frames = self._frames(model, latents, box)
                 folder = inside(self.out, patch_id)  # the id may come from a store that another program wrote
                 write_png(folder / "input.png", prepared.rgb.numpy())
                 write_turntable(folder, frames)
@@ -82,11 +83,19 @@ class Render(Output):
         latents = Latents(car.latents.shape.to(device), car.latents.texture.to(device))
         size = torch.tensor([car.size], device=device)
         box = Box3D(torch.zeros(1, 3, device=device), size, torch.eye(3, device=device)[None])
-        frames = turntable(
-            model.to(device), latents, box, views=self.views, size_px=self.size, elevation_deg=self.elevation
-        )
-        write_turntable(self.out, frames)
+        write_turntable(self.out, self._frames(model.to(device), latents, box))
         return Outcome(f"{car.instance_id} in {self.out}", {"cars": [car.instance_id], "out": str(self.out)})
+
+    def _frames(self, model: CategoryModel, latents: Latents, box: Box3D) -> Turntable:
+        return turntable(
+            model,
+            latents,
+            box,
+            views=self.views,
+            size_px=self.size,
+            elevation_deg=self.elevation,
+            preview=self.preview,
+        )
 
     def _first_views(self, store: PatchStore) -> list[str]:
         ids = store.patch_ids(kept=True, split=self.split, part="test")
