@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from carstudio.models.interface import tiles_that_hit
-from carstudio.rendering.gaussians import hits, tiles
+from carstudio.rendering.gaussians import hits, tiles, tracing
 from carstudio.rendering.gaussians.cloud import GaussianCloud, splats_of
-from carstudio.rendering.gaussians.tracing import SplattingConfig, trace_cloud
+from carstudio.rendering.gaussians.tracing import SplattingConfig, render_cloud, trace_cloud
 from carstudio.rendering.rays import Rays, image_rays, to_canonical
 from carstudio.rendering.volume import composite
 from rendering.gaussian_scenes import camera, car_box, leaves, random_cloud, surface_cloud
@@ -43,12 +43,43 @@ def test_tiles_leave_out_nothing_that_is_met(make, monkeypatch: pytest.MonkeyPat
         assert float((a - b).norm()) < 1e-3 * float(a.norm())
 
 
+def test_classes_of_tiles_give_the_same_picture_with_less_padding(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One class and four: colour, opacity, distance and gradients; some tiles of the picture meet nothing."""
+    rays = tile_rays(48)
+    canonical = to_canonical(rays, car_box())
+    counted, work, results = tiles.encounter, [], []
+
+    def encounter(*arguments: torch.Tensor) -> list[tiles.Encounter]:
+        met = counted(*arguments)
+        work.append(sum(one.opacity.numel() for one in met))
+        return met
+
+    monkeypatch.setattr(tracing, "encounter", encounter)
+    for classes in (1, 4):
+        monkeypatch.setattr(tiles, "CLASSES", classes)
+        parts = leaves(surface_cloud())
+        short = render_cloud(GaussianCloud(*parts), rays, canonical, SplattingConfig(most=400))
+        segments = trace_cloud(GaussianCloud(*parts), rays, canonical, SplattingConfig(most=400))
+        assert torch.allclose(composite(segments).rgb, short.rgb, atol=1e-9)
+        assert torch.equal(segments.distance_m, segments.distance_m.sort(dim=-1).values)
+        gradients = torch.autograd.grad((short.rgb * torch.linspace(0, 1, 3)).sum(), parts)
+        results.append((short, gradients))
+    assert work[2] < 0.8 * work[0]
+    (one, one_gradients), (four, four_gradients) = results
+    assert float(one.opacity.detach().min()) == 0.0
+    assert float(one.opacity.detach().max()) > 0.9
+    for name in ("rgb", "opacity", "distance_m"):
+        assert torch.allclose(getattr(one, name), getattr(four, name), atol=1e-6)
+    for a, b in zip(one_gradients, four_gradients, strict=True):
+        assert float((a - b).norm()) < 1e-3 * float(a.norm())
+
+
 def test_scattered_rays_are_no_tiles() -> None:
     rays = image_rays(camera(32))
     order = torch.randperm(1024, generator=torch.Generator().manual_seed(0))
     canonical, splats = to_canonical(rays.select(order), car_box()), splats_of(surface_cloud())
     points = torch.zeros_like(canonical.origins)
-    met = tiles.encounter(splats, surface_cloud().rgb, points, canonical.view_directions, canonical.near)
+    (met,) = tiles.encounter(splats, surface_cloud().rgb, points, canonical.view_directions, canonical.near)
     assert met.opacity.shape == (1, 400)
     assert met.features.shape == (1, 1024, 25)
 

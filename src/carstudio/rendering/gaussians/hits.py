@@ -16,7 +16,7 @@ from carstudio.rendering.gaussians.cloud import Splats
 from carstudio.rendering.gaussians.reference import FAINTEST, MAX_ALPHA
 
 _CHUNK = {"cpu": 2**17, "other": 2**26}  # ray-splat pairs at a time: on a CPU some arrays of them fit the L2 cache
-_REACH = 4.0  # canonical units: farther from x than this along the ray no Gaussian of a box [-1, 1]^3 can peak
+REACH = 4.0  # canonical units: farther from x than this along the ray no Gaussian of a box [-1, 1]^3 can peak
 
 
 def ray_hits(
@@ -103,7 +103,7 @@ class _Hits(torch.autograd.Function):
             peak[entries, rays] = response
             picked = torch.gather(opacity[entries], -1, places).view_as(rows)
             alpha[entries, rays] = (response * picked).clamp_(max=MAX_ALPHA)
-            t[entries, rays] = torch.gather(at, -1, rows).div_(_scale(num_splats)).masked_fill_(~hit, _REACH)
+            t[entries, rays] = torch.gather(at, -1, rows).div_(_scale(num_splats)).masked_fill_(~hit, REACH)
             index[entries, rays] = rows
         ctx.save_for_backward(coefficients, features, alpha, t, index, peak)
         ctx.mark_non_differentiable(index)
@@ -168,7 +168,7 @@ def _keys(features: Tensor, coefficients: Tensor, limit: Tensor, nearest: Tensor
     over.addcmul_(b, t, value=-1 / scale**2)
     last = 2 ** (29 - _bits(num_splats))
     place = torch.add(t, over.clamp(min=0), alpha=1e12)
-    if bool((nearest > -_REACH).any()):  # the camera is so near that Gaussians may lie behind it
+    if bool((nearest > -REACH).any()):  # the camera is so near that Gaussians may lie behind it
         place = torch.where(t <= nearest[..., None] * scale, float(last), place)
     keys = place.clamp_(-last, last - 1).to(torch.int32).mul_(2 ** _bits(num_splats))
     return keys.add_(torch.arange(num_splats, dtype=torch.int32, device=t.device)), over, t
@@ -181,7 +181,7 @@ def _bits(num_splats: int) -> int:
 
 def _scale(num_splats: int) -> float:
     """Steps of t per canonical unit: -reach to reach takes the bits that the number leaves of 30."""
-    return 2 ** (29 - _bits(num_splats)) / _REACH
+    return 2 ** (29 - _bits(num_splats)) / REACH
 
 
 def _missed(num_splats: int) -> int:

@@ -1,13 +1,14 @@
 """Leaving out early what a whole tile of rays misses, so that cost grows slower than the number of Gaussians.
 
 Rays that follow each other (the 16 of a 4 x 4 tile) are met as one thick ray first: with every Gaussian's reach grown
-by the tile's radius, what the middle ray misses all of them miss. Only the rest is tried ray by ray.
+by the tile's radius, what the middle ray misses all of them miss. Only the rest is tried ray by ray. Tiles that may
+meet about as many Gaussians are worked on together, so that few are padded to the fullest's count.
 """
 
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from carstudio.rendering.gaussians.cloud import Splats, invert_symmetric
@@ -16,6 +17,7 @@ from carstudio.rendering.gaussians.hits import ray_features, reach_limit, splat_
 TILE_PX = 4
 TILE = TILE_PX**2  # rays that are tried together
 COHERENT = 0.7  # canonical radius up to which a group of rays is a tile; scattered rays are tried one by one
+CLASSES = 4  # of tiles by how many Gaussians they may meet, each of as many tiles
 _INSIDE = 1.75  # canonical units from the middle of a ray to where it leaves the box, at most sqrt(3)
 _SHARE = 0.5  # of the outer ellipsoid: (1 + a) Sigma + (1 + 1 / a) r^2 / limit holds ellipsoid plus ball for any a > 0
 
@@ -29,6 +31,8 @@ class Encounter:
     rgb: Float[Tensor, "group splat 3"]
     features: Float[Tensor, "group ray 25"]
     nearest: Float[Tensor, "group ray"]
+    groups: Int[Tensor, " group"] | None = None
+    """Numbers of the groups among all tiles; None: these are all groups, the batch's entries."""
 
 
 def encounter(
@@ -37,11 +41,14 @@ def encounter(
     points: Float[Tensor, "batch ray 3"],
     directions: Float[Tensor, "batch ray 3"],
     nearest: Float[Tensor, "batch ray"],
-) -> Encounter:
-    """By tiles where the rays come in tiles that lie together; else every ray of a batch entry with every Gaussian."""
+) -> list[Encounter]:
+    """By tiles where the rays come in tiles that lie together; else every ray of a batch entry with every Gaussian.
+
+    Tiles that can meet none are in no encounter.
+    """
     coefficients = splat_coefficients(splats)
     features = torch.cat(ray_features(points, directions), dim=-1)
-    whole = Encounter(coefficients, splats.opacity, rgb, features, nearest)
+    whole = [Encounter(coefficients, splats.opacity, rgb, features, nearest)]
     if points.shape[1] % TILE:
         return whole
     with torch.no_grad():
@@ -49,18 +56,32 @@ def encounter(
         middle, toward, radius = tile_radius(*tiles)
         if float(radius) > COHERENT:
             return whole
-        candidates, is_met = _candidates(splats, middle, toward, radius, len(points))
-    entry = torch.arange(len(candidates), device=points.device) // (points.shape[1] // TILE)
-    flat = (candidates + entry[:, None] * rgb.shape[1]).flatten()
+        is_met = _is_met(splats, middle, toward, radius, len(points))
+        counts = is_met.sum(dim=-1)
+        by_count = counts.argsort()[int((counts == 0).sum()) :]
+        if len(by_count) == 0:
+            return whole
+        classes = by_count.tensor_split(min(CLASSES, max(1, len(by_count) // TILE)))
     table = torch.cat([coefficients.mT, splats.opacity[..., None], rgb], dim=-1).flatten(0, 1)
-    taken = table.index_select(0, flat).unflatten(0, candidates.shape)
-    return Encounter(
-        taken[..., :10].mT.contiguous(),
-        taken[..., 10] * is_met,
-        taken[..., 11:],
-        features.unflatten(1, (-1, TILE)).flatten(0, 1),
-        nearest.unflatten(1, (-1, TILE)).flatten(0, 1),
-    )
+    features = features.unflatten(1, (-1, TILE)).flatten(0, 1)
+    nearest = nearest.unflatten(1, (-1, TILE)).flatten(0, 1)
+    found = []
+    for chosen in classes:
+        met, candidates = is_met[chosen].to(torch.uint8).topk(int(counts[chosen[-1]]), dim=-1)
+        entry = chosen // (points.shape[1] // TILE)
+        flat = (candidates + entry[:, None] * rgb.shape[1]).flatten()
+        taken = table.index_select(0, flat).unflatten(0, candidates.shape)
+        found.append(
+            Encounter(
+                taken[..., :10].mT.contiguous(),
+                taken[..., 10] * met,
+                taken[..., 11:],
+                features[chosen],
+                nearest[chosen],
+                chosen,
+            )
+        )
+    return found
 
 
 def tile_radius(
@@ -73,10 +94,8 @@ def tile_radius(
     return point, direction, stray.max()
 
 
-def _candidates(
-    splats: Splats, middle: Tensor, toward: Tensor, radius: Tensor, batch: int
-) -> tuple[Int[Tensor, "tile candidate"], Float[Tensor, "tile candidate"]]:
-    """Numbers of the Gaussians that each tile may meet, as many for each as the fullest needs, and 1 where it does."""
+def _is_met(splats: Splats, middle: Tensor, toward: Tensor, radius: Tensor, batch: int) -> Bool[Tensor, "tile splat"]:
+    """Which Gaussians each tile may meet."""
     limit = reach_limit(splats.opacity).clamp(min=1e-3)
     covariance, _ = invert_symmetric(splats.precision)
     ball = (1 + 1 / _SHARE) * radius**2 / limit
@@ -85,8 +104,4 @@ def _candidates(
     coefficients = splat_coefficients(Splats(splats.mean, outer, splats.opacity))
     features = ray_features(*(rays.view(batch, -1, 3) for rays in (middle, toward)))
     c, b, e = (part @ coefficients[:, : part.shape[-1]] for part in features)
-    over = (c - b * b / e - reach_limit(splats.opacity)[:, None]).flatten(0, 1)
-    is_met = over < 0
-    width = max(1, int(is_met.sum(dim=-1).max()))
-    met, candidates = is_met.to(torch.uint8).topk(width, dim=-1)
-    return candidates, met.to(over.dtype)
+    return (c - b * b / e < reach_limit(splats.opacity)[:, None]).flatten(0, 1)
