@@ -3,7 +3,8 @@
 Usage: python -m bench.stopping STORE [--split view] [--cars 12] [--steps 100] [--field-rate 3e-3] [--look-every 5]
 
 The bundled `car-gaussians` is fitted to the training part of a split, one car at a time; the test part is scored. Each
-line is a way to stop; the two last know nothing of the car: a number of steps for all, and the best one in hindsight.
+line is a way to stop, with its paired difference to the first one and the 95 % interval of that by resampling cars;
+then numbers of steps that are the same for all cars, and the best of these for each car in hindsight.
 """
 
 import statistics
@@ -18,9 +19,12 @@ import carstudio
 from carstudio.dataset.pixels import PatchCache, PreparedPatch
 from carstudio.dataset.store import open_store
 from carstudio.evaluation.learning_curve import fittable_cars, score_fitted
+from carstudio.evaluation.summary import estimate
 from carstudio.fitting.optimise import FitConfig, Fitted
 from carstudio.models.interface import CategoryModel, Latents
 from carstudio.training.patch_fitting import fit_cars
+
+FIXED = (0, 5, 10, 20, 40)
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,8 @@ class Bench:
     look_every: int = 5
     patience: int = 5
     held: tuple[int, ...] = (1, 2)
+    refit: bool = False
+    """Whether to fit all photographs anew for as long as the held-out ones said."""
 
 
 def best_step(fitted: Fitted) -> int:
@@ -85,21 +91,39 @@ def main(options: Bench) -> None:
             at = best_step(done)
             value = score(model, done.latents, done.weights, photos, held_out)
             found.setdefault(name, []).append((value, at, seconds))
-            if config.hold_out_views:
+            if config.hold_out_views and options.refit:
                 again, more = fitted(replace(config, steps=at, hold_out_views=0), False)
                 value = score(model, again.latents, again.weights, photos, held_out)
                 found.setdefault(f"{name}, then all of them for as long", []).append((value, at, seconds + more))
-        for steps in (0, 5, 10, 20, 40, options.steps):
-            done, _ = fitted(replace(base, steps=steps), False)
-            fixed.setdefault(steps, []).append(score(model, done.latents, done.weights, photos, held_out))
+        kept: dict[int, tuple[Latents, dict[str, torch.Tensor]]] = {}
+
+        def watch(step: int, model: CategoryModel, latents: Latents, kept: dict = kept) -> None:
+            if step in (*FIXED, options.steps):
+                weights = dict(model.field_parameters()) if options.field_rate else {}
+                copied = {name: weight.detach().clone() for name, weight in weights.items()}
+                kept[step] = Latents(latents.shape.detach().clone(), latents.texture.detach().clone()), copied
+
+        fit_cars(model, [photos], base, stops_early=False, watch=watch)
+        for steps, (latents, weights) in kept.items():
+            fixed.setdefault(steps, []).append(score(model, latents, weights, photos, held_out))
     print(f"{len(cars)} cars, {len(cars[0].fitted)} photos, {len(cars[0].held_out)} scored views of the first\n")
-    print("| stopped by | PSNR of other views | steps kept, mean | CPU-seconds |\n|---|---:|---:|---:|")
+    print("| stopped by | PSNR of other views | against the first | steps kept, mean | CPU-seconds |")
+    print("|---|---:|---:|---:|---:|")
+    first = [value for value, *_ in next(iter(found.values()))]
     for name, rows in found.items():
-        print(f"| {name} | {' | '.join(f'{statistics.fmean(part):.2f}' for part in zip(*rows, strict=True))} |")
+        value, steps_kept, seconds = (statistics.fmean(part) for part in zip(*rows, strict=True))
+        gain = _against(first, [row[0] for row in rows])
+        print(f"| {name} | {value:.2f} | {gain} | {steps_kept:.0f} | {seconds:.2f} |")
     for steps, values in fixed.items():
-        print(f"| {steps} steps | {statistics.fmean(values):.2f} | {steps} | |")
+        print(f"| {steps} steps | {statistics.fmean(values):.2f} | {_against(first, values)} | {steps} | |")
     hindsight = statistics.fmean(max(values) for values in zip(*fixed.values(), strict=True))
-    print(f"| the best of these numbers, known afterwards | {hindsight:.2f} | | |")
+    print(f"| the best of these numbers, known afterwards | {hindsight:.2f} | | | |")
+
+
+def _against(first: list[float], values: list[float]) -> str:
+    apart = [value - other for value, other in zip(values, first, strict=True)]
+    found = estimate(apart, [str(i) for i in range(len(apart))])
+    return f"{found.mean:+.2f}" if found.low is None else f"{found.mean:+.2f} [{found.low:+.2f}, {found.high:+.2f}]"
 
 
 if __name__ == "__main__":
