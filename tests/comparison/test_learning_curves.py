@@ -96,10 +96,10 @@ def test_tracks_are_scored_by_angle_and_drawn_above_their_truth(made: tuple[Path
         "6 steps of some 128 rays of each car; scored: at most 2 held-out views and 2 fitted (43 rays of each" in text
     )
     strips = read_image(out / "strips.png")
-    assert strips.shape[0] == 2 * (3 + 1) * 60 + 8, "two fits of Gaussians, NSG and the truth for each car, and a gap"
+    assert strips.shape[0] == 2 * (3 + 1) * 40 + 8, "two fits of Gaussians, NSG and the truth for each car, and a gap"
     left = strips.shape[1] - 80 * 20
-    truth = strips[3 * 60 : 4 * 60, left + 80 :].astype(int)
-    tiles = truth.reshape(60, 19, 80, 3).transpose(1, 0, 2, 3)
+    truth = strips[3 * 40 : 4 * 40, left + 80 :].astype(int)
+    tiles = truth.reshape(40, 19, 80, 3).transpose(1, 0, 2, 3)
     drawn = (tiles < 250).any(axis=-1).reshape(19, -1).mean(axis=1)
     assert (drawn > 0.1).all(), "a true view for every turn"
     widths = (tiles < 250).any(axis=(1, 3)).sum(axis=1)

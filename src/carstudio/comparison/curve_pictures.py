@@ -17,7 +17,7 @@ from carstudio.report.rotation_strip import rotation_strip, seen_by, strip_camer
 from carstudio.report.sheets import Pixels, fit, named_rows, side_by_side
 from carstudio.training.batches import stack_boxes
 
-TILE_PX, STRIP_TILE_PX, SIDE_BY_SIDE = (128, 80), (80, 60), 2
+TILE_PX, STRIP_TILE_PX, SIDE_BY_SIDE = (128, 80), (80, 40), 2
 STATES = ("before", "+ latents", "+ field, or no prior")
 
 
