@@ -39,7 +39,8 @@ class FitConfig:
     """Steps between looks at the held-out pixels."""
     hold_out_views: int = 0
     """Photographs of a car that no step shows, so that they tell when to stop; at least one is always shown. 0, and for
-    a car of one photograph: other pixels of the shown ones tell, which do not notice a fit to these views alone."""
+    a car of one photograph: other pixels of the shown ones tell, which do not notice a fit to these views alone. One
+    view gains where the field is fitted and loses where codes alone are, which overfit late (docs/experiments.md)."""
     box: BoxFreedom = field(default_factory=BoxFreedom)
     """Whether boxes are refined too."""
 
