@@ -8,6 +8,7 @@ from carstudio.dataset.splits import (
     make_split,
     seen_from,
     split_as_released,
+    split_by_drive,
     split_by_instance,
     split_by_view,
     split_by_yaw,
@@ -79,3 +80,12 @@ def test_released_split_in_exact_arithmetic(count: int) -> None:
     train = {i for i, view in enumerate(views) if split_as_released(views)[view.patch_id] == "train"}
     assert len(train) == num_train
     assert len(train ^ exact) <= 2
+
+
+def test_drive_split_by_hand() -> None:
+    """A drive from 170 over 180 to -160 degrees: 175 and -165 lie within it, the rest of the turn is tested."""
+    drive = [View(f"d{i}", "c", i, "c") for i in range(3)]
+    turned = [View(f"t{i}", "c", 10 + i) for i in range(5)]
+    degrees = {"d0": 170.0, "d1": -175.0, "d2": -160.0, "t0": 175.0, "t1": -165.0, "t2": -159.0, "t3": 169.0, "t4": 0.0}
+    parts = split_by_drive(seen_from([*drive, *turned, View("x", "other", 0)], degrees | {"x": 5.0}))
+    assert parts == dict.fromkeys(("d0", "d1", "d2"), "train") | dict.fromkeys(("t2", "t3", "t4"), "test")

@@ -12,6 +12,7 @@ from carstudio.dataset.sources.synthetic import SynthConfig, car_records, patch_
 from carstudio.dataset.store import PatchStore, open_store
 from carstudio.errors import InputError
 from carstudio.geometry.box3d import envelope
+from carstudio.geometry.orbit import viewing_angles
 from carstudio.geometry.overlap import box2d_iou
 
 
@@ -105,3 +106,32 @@ def test_meshes_go_the_same_way(test_data: Path, tmp_path: Path) -> None:
 def test_wrong_settings_are_told(tmp_path: Path, settings: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         synthesize(SynthConfig(out=tmp_path / "s", **settings))
+
+
+def test_tracks_are_drives_and_true_turned_views_of_other_sides(tmp_path: Path) -> None:
+    out = tmp_path / "tracks"
+    config = SynthConfig(out=out, cars=3, views=4, size=48, seed=5, tracks=True, workers=1)
+    assert synthesize(config).candidates == 3 * (4 + 18)
+    store = open_store(out)
+    assert store.verify() == []
+    train, test = (set(store.patch_ids(split="yaw", part=part)) for part in ("train", "test"))
+    for index in range(3):
+        records = [store.record(name) for name in patch_ids(config, index)]
+        frames, turned = records[:4], records[4:]
+        assert {record.instance_id for record in records} == {f"syn-5-{index:06d}"}
+        assert [record.frame_index for record in frames] == [0, 1, 2, 3]
+        assert {record.sequence_id for record in frames} == {f"syn-5-{index:06d}"}
+        assert {(record.frame_index, record.sequence_id) for record in turned} == {(None, None)}
+        assert {record.box_center for record in turned} == {frames[2].box_center}
+        assert {record.patch_id for record in frames} <= train
+        seen, unseen = (
+            np.exp(1j * np.array([float(viewing_angles(r.box)[0]) for r in part if r.patch_id in side and r.box]))
+            for part, side in ((frames, train), (turned, test))
+        )
+        assert len(unseen) >= 16
+        middle = seen.mean() / abs(seen.mean())
+        ends = np.angle(seen / middle).min(), np.angle(seen / middle).max()
+        beside = np.angle(unseen / middle)
+        assert ((beside < ends[0]) | (beside > ends[1])).all()
+    with pytest.raises(InputError, match="leave --cameras phone out"):
+        synthesize(SynthConfig(out=tmp_path / "phone", cars=1, tracks=True, cameras="phone"))

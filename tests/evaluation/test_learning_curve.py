@@ -8,7 +8,14 @@ import torch
 from carstudio.dataset.pixels import PatchCache
 from carstudio.dataset.store import PatchStore
 from carstudio.errors import InputError
-from carstudio.evaluation.learning_curve import CurveConfig, fittable_cars, learning_curve
+from carstudio.evaluation.learning_curve import (
+    CurveConfig,
+    FittableCar,
+    fittable_cars,
+    learning_curve,
+    scored_views,
+    turned_deg,
+)
 from carstudio.evaluation.metrics import score_image
 from carstudio.models.interface import Latents, render_image
 from carstudio.training.batches import patch_batch, stack_boxes
@@ -94,3 +101,17 @@ def test_company_changes_no_cars_curve(store: PatchStore, trained: Path) -> None
     for a, b in zip(together, alone, strict=True):
         assert a.scored.pair == b.scored.pair
         torch.testing.assert_close(a.scored.rgb, b.scored.rgb, rtol=0, atol=1e-4)
+
+
+def test_few_scored_views_go_from_the_nearest_to_the_farthest_around(store: PatchStore, trained: Path) -> None:
+    cache = PatchCache(store, 8)
+    names = [name for name in store.patch_ids() if cache[name].instance_id == cache[store.patch_ids()[0]].instance_id]
+    car = FittableCar("c", (names[0],), tuple(names[1:]))
+    angles = {name: turned_deg(cache[name], [cache[names[0]]]) for name in car.held_out}
+    assert scored_views(car, cache, None) == scored_views(car, cache, len(names)) == car.held_out
+    two = scored_views(car, cache, 2)
+    assert [angles[name] for name in two] == [min(angles.values()), max(angles.values())]
+    assert len(set(scored_views(car, cache, len(car.held_out) - 1))) == len(car.held_out) - 1
+    config = CurveConfig(marks=(1,), rays=16, held_out_views=1, fitted_views=1)
+    points = learning_curve(load_model(trained), store, [car], config)
+    assert [p.scored.pair.scored_patch_id for p in points] == [*scored_views(car, cache, 1), names[0]]

@@ -1,6 +1,7 @@
 """Fitting: what stays stays to the bit, what is fitted gets better, a batch is as good as one."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ import torch
 from carstudio.cli import run
 from carstudio.commands.fit import car_folders, photographs_of
 from carstudio.commands.opening import open_car
-from carstudio.dataset.pixels import PatchCache
+from carstudio.dataset.pixels import PatchCache, PreparedPatch
 from carstudio.dataset.store import PatchStore
 from carstudio.errors import InputError
 from carstudio.fitting.boxes import BoxFreedom
@@ -18,7 +19,7 @@ from carstudio.fitting.optimise import FitConfig, Fitted
 from carstudio.models.interface import CategoryModel
 from carstudio.training.batches import patch_batch
 from carstudio.training.checkpoint import load_model
-from carstudio.training.patch_fitting import fit_cars
+from carstudio.training.patch_fitting import fit_cars, held_out_places
 from carstudio.training.trainer import train
 from training.toy import TINY, toy_store
 
@@ -115,6 +116,63 @@ def test_company_changes_no_car_not_even_when_it_stops(store: PatchStore, traine
         row += len(group)
     assert len(ends) > 1, "cars that all stop together would show nothing"
     assert (moved > 0.01) is refines
+
+
+def test_held_out_places_are_few_and_spread() -> None:
+    assert held_out_places(5, 0) == held_out_places(1, 3) == ()
+    assert held_out_places(5, 1) == (2,)
+    assert held_out_places(8, 2) == (2, 6)
+    for count in range(2, 9):
+        for most in range(1, 9):
+            places = held_out_places(count, most)
+            assert len(set(places)) == len(places) == min(most, count - 1)
+            assert set(places) < set(range(count))
+
+
+def test_no_step_sees_a_view_that_is_held_out(store: PatchStore, trained: Path) -> None:
+    """What the view shows changes where the fit stops, and no step."""
+    model = load_model(trained)
+    cache = PatchCache(store, model.encoder_side_px)
+    photos = [cache[patch_id] for patch_id in photographs_of(store, cars(store)[0], None)]
+    (place,) = held_out_places(len(photos), 1)
+    damaged = [replace(p, rgb=255 - p.rgb) if i == place else p for i, p in enumerate(photos)]
+    config = FitConfig(steps=9, latent_rate=0.05, look_every=3, patience=9, hold_out_views=1)
+
+    def watched(photos: list[PreparedPatch]) -> tuple[Fitted, list[torch.Tensor]]:
+        seen: list[torch.Tensor] = []
+        watch = lambda _, __, latents: seen.append(latents.shape.detach().clone())  # noqa: E731
+        return fit_cars(model, [photos], config, rays=32, watch=watch), seen
+
+    (truly, steps), (wrongly, same_steps) = watched(photos), watched(damaged)
+    assert all(torch.equal(a, b) for a, b in zip(steps, same_steps, strict=True))
+    assert truly.curves[0][0][1] != wrongly.curves[0][0][1]
+    without = fit_cars(model, [photos], replace(config, hold_out_views=0), rays=32)
+    assert not torch.equal(without.latents.shape, truly.latents.shape), "one photograph more is shown"
+
+
+def test_company_changes_no_car_where_views_are_held_out(store: PatchStore, trained: Path) -> None:
+    """Cars of one photograph among them, whose other pixels tell."""
+    model = load_model(trained)
+    cache = PatchCache(store, model.encoder_side_px)
+    groups = [[cache[patch_id] for patch_id in photographs_of(store, name, None)] for name in cars(store)[:3]]
+    groups[1] = groups[1][:1]
+    config = FitConfig(steps=24, latent_rate=0.1, patience=1, look_every=3, hold_out_views=1)
+    together = fit_cars(model, groups, config, rays=32)
+    for index, group in enumerate(groups):
+        alone = fit_cars(model, [group], config, rays=32)
+        best = min(range(len(alone.curve)), key=lambda i: alone.curve[i][1])
+        for place in range(best + 1):
+            assert together.curves[index][place] == pytest.approx(alone.curve[place], rel=1e-3)
+        torch.testing.assert_close(together.latents.shape[index], alone.latents.shape[0], rtol=1e-3, atol=1e-4)
+    by_pixels = fit_cars(model, [groups[1]], replace(config, hold_out_views=0), rays=32)
+    torch.testing.assert_close(together.latents.shape[1], by_pixels.latents.shape[0], rtol=1e-3, atol=1e-4)
+
+
+def test_boxes_of_held_out_views_are_not_refined() -> None:
+    with pytest.raises(InputError, match="take either hold-out-views, or refine-pose"):
+        FitConfig(hold_out_views=1, box=BoxFreedom(refine_pose=True))
+    with pytest.raises(InputError, match="hold-out-views must be 0 or more"):
+        FitConfig(hold_out_views=-1)
 
 
 def test_the_verb_fits_all_cars_and_keeps_those_that_are_there(

@@ -10,7 +10,7 @@ from carstudio.commands.build import describe_unfinished
 from carstudio.commands.command import Outcome, Output, plain
 from carstudio.dataset.duplicates import find_duplicates
 from carstudio.dataset.fingerprints import Likeness
-from carstudio.dataset.measured import measure
+from carstudio.dataset.measured import azimuths_deg, measure
 from carstudio.dataset.merge import merge_stores
 from carstudio.dataset.runs import write_run
 from carstudio.dataset.splits import SplitBy, count_parts, kept_views, make_split, seen_from, write_splits
@@ -72,9 +72,7 @@ class Split(Output):
                 )
             views = kept_views(store)
             if self.by == "yaw":
-                measured = measure(store)
-                azimuths = zip(measured.patch_id.tolist(), measured.values["azimuth_deg"].tolist(), strict=True)
-                views = seen_from(views, dict(azimuths))
+                views = seen_from(views, azimuths_deg(measure(store)))
             parts = make_split(views, by=self.by, test_share=self.test_share, seed=self.seed)
             store.write_split(self.name, parts)
             settings = {"by": self.by, "test_share": self.test_share, "seed": self.seed}

@@ -17,7 +17,7 @@ from carstudio.fitting.optimise import FitConfig, Fitted
 from carstudio.models.interface import CategoryModel
 from carstudio.progress import Report
 from carstudio.training.checkpoint import describe_model, load_model
-from carstudio.training.patch_fitting import fit_cars
+from carstudio.training.patch_fitting import fit_cars, held_out_places
 
 ALL = "all"
 
@@ -112,6 +112,9 @@ class Fit(Output):
         length, height, width = (float(side) for side in size)
         about: dict[str, Any] = {"patches": patch_ids, "data_sha256": store.data_sha256, "steps": fitted.steps}
         curve = fitted.curves[index] if fitted.curves else ()
+        if self.config.hold_out_views:
+            places = held_out_places(len(patch_ids), self.config.hold_out_views)
+            about["hold_out_views"] = [patch_ids[place] for place in places]
         if fitted.box is not None:
             about["boxes"] = [_box_value(fitted, row) for row in range(first, first + len(patch_ids))]
         return Car(

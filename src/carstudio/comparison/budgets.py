@@ -5,7 +5,7 @@
 """
 
 import dataclasses
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from carstudio.models.encoders import SMALL_PYRAMID_FEATURES, EncoderConfig
@@ -36,6 +36,29 @@ class FieldSize:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Fitting:
+    """What fitting a car at test time and looking at it may take (`table ttopt`)."""
+
+    marks: tuple[int, ...] = (0, 5, 10, 20, 50, 100, 200, 500, 1000)
+    """Steps after which views are scored."""
+    rays_per_car: int | None = None
+    """Rays of a step for each car, shared out evenly among its photos; None: 256 of each photo."""
+    scored_views: int | None = None
+    """Held-out views of each car that are scored; None: all."""
+    fitted_views: int = 2
+    """Fitted views of each car that are scored beside them."""
+
+    def __str__(self) -> str:
+        rays = "256 rays of each photo" if self.rays_per_car is None else f"some {self.rays_per_car} rays of each car"
+        scored = "all" if self.scored_views is None else f"at most {self.scored_views}"
+        return f"{self.marks[-1]:,} steps of {rays}; scored: {scored} held-out views and {self.fitted_views} fitted"
+
+    def rays_per_photo(self, num_photos: int, num_cars: int) -> int:
+        """Rays of each photo in a step: the same for all photos of a run, whatever car they are of."""
+        return 256 if self.rays_per_car is None else max(8, round(self.rays_per_car * num_cars / num_photos))
+
+
+@dataclass(frozen=True, kw_only=True)
 class Budget:
     """Length of each row's training, size of the fields (None: each paper's), and how many images are scored."""
 
@@ -44,6 +67,7 @@ class Budget:
     cpu_seconds: float | None = None
     size: FieldSize | None = None
     scored: int | None = None
+    fitting: Fitting = field(default_factory=Fitting)
 
     def __str__(self) -> str:
         length = f"{self.steps:,} steps" if self.cpu_seconds is None else f"{self.cpu_seconds:,.0f} CPU-seconds"
@@ -57,6 +81,7 @@ BUDGETS: dict[BudgetName, Budget] = {
         steps=20,
         size=FieldSize(encoder_side_px=32, width=32, code_size=32, samples=8, patches_per_step=4, rays_per_patch=64),
         scored=4,
+        fitting=Fitting(marks=(0, 2, 6), rays_per_car=128, scored_views=2, fitted_views=2),
     ),
     "cpu": Budget(
         name="cpu",
@@ -65,6 +90,7 @@ BUDGETS: dict[BudgetName, Budget] = {
             encoder_side_px=64, width=128, code_size=128, samples=20, patches_per_step=16, rays_per_patch=48
         ),
         scored=100,
+        fitting=Fitting(marks=(0, 10, 20, 50, 100, 200), rays_per_car=384, scored_views=4, fitted_views=1),
     ),
     "gpu": Budget(name="gpu", steps=20_000, scored=400),
     "paper": Budget(name="paper", steps=500_000),
@@ -83,7 +109,7 @@ def within(budget: Budget, config: TrainConfig) -> TrainConfig:
 def _shrunk(config: TrainConfig, budget: Budget) -> TrainConfig:
     size = budget.size
     assert size is not None
-    fields = {field.name for field in dataclasses.fields(config.model)}
+    fields = {one.name for one in dataclasses.fields(config.model)}
     if "sampling" not in fields:  # no radiance field: its own size, which is small already
         return config if budget.name != "smoke" else replace(config, patches_per_step=size.patches_per_step)
     own: Any = config.model

@@ -80,6 +80,11 @@ def measure(store: PatchStore) -> Measured:
     )
 
 
+def azimuths_deg(measured: Measured) -> dict[str, float]:
+    """patch_id -> from where around its car it was taken; NaN without a 3-D box."""
+    return dict(zip(measured.patch_id.tolist(), measured.values["azimuth_deg"].tolist(), strict=True))
+
+
 def _columns(table: pa.Table) -> dict[str, Column]:
     values = {name: _numbers(table[name]) for name in (*_NUMBERS, *_SIZES)}
     box2d, center, size = (

@@ -3,6 +3,7 @@
 - `instance`: no car on both sides (zero-shot).
 - `view`: the same cars, later views held out (multi-view, test-time optimisation).
 - by yaw (`dataset split --by yaw`): the same cars, seen from sides that do not train.
+- `yaw` of synthetic tracks: a drive trains, the car turned to the sides that the drive did not see is tested.
 - `released-patch`: the released code's split by patch in store order; the same car stands on both sides.
 
 Pictures that repeat each other (`duplicates.parquet`, where somebody has looked) are on one side of every split but the
@@ -125,6 +126,35 @@ def _turned(members: Sequence[View], view: View) -> float:
     if first is None or view.azimuth_rad is None:
         return 0.0
     return abs(math.remainder(view.azimuth_rad - first, 2 * math.pi))
+
+
+def split_by_drive(views: Sequence[View]) -> Parts:
+    """Of each instance the views of a sequence train; of the others those from outside its range of azimuths test.
+
+    Views from within the range, which would tell little, and views without a 3-D box stand in neither part.
+    """
+    drives: dict[str, list[float]] = {}
+    for view in views:
+        if view.sequence_id is not None and view.azimuth_rad is not None:
+            drives.setdefault(view.instance_id, []).append(view.azimuth_rad)
+    parts: Parts = {}
+    for view in views:
+        if view.azimuth_rad is None or view.instance_id not in drives:
+            continue
+        if view.sequence_id is not None:
+            parts[view.patch_id] = "train"
+        elif not _is_between(view.azimuth_rad, drives[view.instance_id]):
+            parts[view.patch_id] = "test"
+    return parts
+
+
+def _is_between(azimuth_rad: float, azimuths_rad: Sequence[float]) -> bool:
+    """Whether a direction lies in the range of others, rad; they go less than half way around."""
+    low, high = 0.0, 0.0
+    for other in azimuths_rad:
+        turn = math.remainder(other - azimuths_rad[0], 2 * math.pi)
+        low, high = min(low, turn), max(high, turn)
+    return low <= math.remainder(azimuth_rad - azimuths_rad[0], 2 * math.pi) <= high
 
 
 SplitBy = Literal["instance", "view", "sequence", "patch", "yaw"]

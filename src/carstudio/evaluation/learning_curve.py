@@ -44,6 +44,8 @@ class CurveConfig:
     """Pixels per photograph and step."""
     cars_per_batch: int = 8
     """Cars fitted together; where the field is fitted they share it."""
+    held_out_views: int | None = None
+    """Held-out views per car that are scored: from the nearest to a fitted one to the farthest around; None: all."""
     fitted_views: int = 2
     """Views per car that were fitted and are scored too."""
     split: str = "view"
@@ -111,6 +113,16 @@ def fittable_cars(store: PatchStore, split: str = "view") -> list[FittableCar]:
     return cars
 
 
+def scored_views(car: FittableCar, cache: PatchCache, most: int | None) -> tuple[str, ...]:
+    """The held-out views that are scored: all, or `most` of them, evenly by how far they turn from the fitted ones."""
+    if most is None or len(car.held_out) <= most:
+        return car.held_out
+    fitted = [cache[patch] for patch in car.fitted]
+    ranked = sorted(car.held_out, key=lambda patch: (turned_deg(cache[patch], fitted), patch))
+    last = len(ranked) - 1
+    return tuple(ranked[round(i * last / max(1, most - 1))] for i in range(most))
+
+
 OnFitted = Callable[[FittableCar, CategoryModel, Latents], None]
 
 
@@ -162,11 +174,12 @@ def _curve_of_batch(
     photos = [[cache[patch] for patch in car.fitted] for car in cars]
     fit_cars(model, photos, fit_config, rays=config.rays, seed=config.seed, stops_early=False, watch=watch)
     points = []
+    scored_of = {car.instance_id: scored_views(car, cache, config.held_out_views) for car in cars}
     for steps, snapshot in snapshots.items():
         shown = _with_weights(model, snapshot.weights)
         for index, car in enumerate(cars):
             latents = snapshot.latents.select(index)
-            for patch in car.held_out + car.fitted[: config.fitted_views]:
+            for patch in scored_of[car.instance_id] + car.fitted[: config.fitted_views]:
                 scored = score_fitted(shown, latents, cache[car.fitted[0]], cache[patch], lpips)
                 views: Views = "held-out" if patch in car.held_out else "fitted"
                 points.append(CurvePoint(steps, views, scored, turned_deg(cache[patch], photos[index])))

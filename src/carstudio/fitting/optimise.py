@@ -37,12 +37,23 @@ class FitConfig:
     """Stop after so many looks at the held-out pixels without a better one; the best is kept."""
     look_every: int = 10
     """Steps between looks at the held-out pixels."""
+    hold_out_views: int = 0
+    """Photographs of a car that no step shows, so that they tell when to stop; at least one is always shown. 0, and for
+    a car of one photograph: other pixels of the shown ones tell, which do not notice a fit to these views alone. One
+    view gains where the field is fitted and loses where codes alone are, which overfit late (docs/experiments.md)."""
     box: BoxFreedom = field(default_factory=BoxFreedom)
     """Whether boxes are refined too."""
 
     def __post_init__(self) -> None:
         if self.steps < 0 or self.latent_rate < 0 or self.field_rate < 0 or min(self.patience, self.look_every) < 1:
             raise InputError("fit: steps and rates must be 0 or more, patience and looks at least 1")
+        if self.hold_out_views < 0:
+            raise InputError(f"fit: hold-out-views must be 0 or more, found {self.hold_out_views}")
+        if self.hold_out_views and (self.box.refine_pose or self.box.refine_size):
+            raise InputError(
+                "fit: boxes of views that no step shows cannot be refined; take either hold-out-views, or refine-pose "
+                "and refine-size"
+            )
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,9 @@ from torch import Tensor
 
 from carstudio.geometry.box3d import Box3D
 from carstudio.geometry.camera import Camera
+from carstudio.geometry.transforms import rotation_y
+
+NUM_TURNS = 19  # of a car turned all around in steps of 360 / 19 degrees: the figure of the paper's comparison with NSG
 
 
 def orbit_box(size: Float[Tensor, "3"], *, azimuth_deg: float, elevation_deg: float, distance_m: float) -> Box3D:
@@ -44,3 +47,9 @@ def viewing_angles(box: Box3D) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "
     """
     x, y, z = (-(box.center[..., None, :] @ box.rotation)[..., 0, :]).unbind(-1)
     return torch.atan2(z, x), torch.atan2(-y, torch.hypot(x, z))
+
+
+def turned_box(box: Box3D, angle_rad: float) -> Box3D:
+    """The car turned to its left where it stands, about its vertical axis."""
+    turn = rotation_y(torch.tensor(angle_rad, dtype=box.rotation.dtype, device=box.rotation.device))
+    return Box3D(box.center, box.size, box.rotation @ turn)

@@ -84,6 +84,21 @@ def side_by_side(
     return np.array(sheet)
 
 
+def named_rows(rows: Sequence[tuple[str, Pixels]]) -> Pixels:
+    """Pictures of one width below each other, each with its name to the left; a gap where the name is empty."""
+    font = ImageFont.load_default(TEXT_PX)
+    left = 2 * GAP_PX + math.ceil(max(font.getlength(name) for name, _ in rows))
+    heights = [picture.shape[0] if name else GAP_PX for name, picture in rows]
+    sheet = Image.new("RGB", (left + rows[0][1].shape[1], sum(heights)), PAPER)
+    draw, top = ImageDraw.Draw(sheet), 0
+    for (name, picture), height in zip(rows, heights, strict=True):
+        if name:
+            sheet.paste(Image.fromarray(picture), (left, top))
+            draw.text((GAP_PX, top + height / 2), name, INK, font, anchor="lm")
+        top += height
+    return np.array(sheet)
+
+
 def view_pictures(
     *,
     source: Pixels,

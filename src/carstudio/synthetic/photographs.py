@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from carstudio.synthetic.cameras import CameraKind, Viewpoint, draw_viewpoint, viewpoint_at
 from carstudio.synthetic.cars import Car
+from carstudio.synthetic.drives import draw_drive, turned_views
 from carstudio.synthetic.light import Light, draw_light
 from carstudio.synthetic.sensor import Sensor, develop, draw_sensor
 from carstudio.synthetic.shading import Scene, prepare_scene, shade
@@ -159,6 +160,28 @@ def draw_shots(
         viewpoint = draw_viewpoint(rng, car.mesh, kind=cameras, azimuth_rad=float(azimuths[view]), size_px=size_px)
         sensor, noise = draw_sensor(rng), np.random.default_rng([*seed, 4, view]).integers(2**30)
         yield Shot(viewpoint, sensor, render(viewpoint, int(noise)), rng)
+
+
+def photograph_drive(
+    car: Car, *, seed: tuple[int, ...], num_frames: int, num_turns: int, size_px: int, renderer: Renderer | None = None
+) -> list[Photograph]:
+    """The frames of a drive past a car, then the car of its middle frame after 1 ... `num_turns` - 1 turns.
+
+    One light and one sensor for all; what turns is the camera about the car, so that light stays on the same side of
+    it, as it does on a car that a model has learned and turns.
+    """
+    scene = draw_scene(car, np.random.default_rng([*seed, 1]))
+    render = (renderer or RayCaster()).prepare(scene)
+    rng = np.random.default_rng([*seed, 5])
+    drive = draw_drive(rng, car.mesh, num_frames=num_frames, size_px=size_px)
+    turned = turned_views(rng, car.mesh, drive[num_frames // 2], num_turns=num_turns, size_px=size_px)
+    sensor = draw_sensor(np.random.default_rng([*seed, 6]))
+    photographs = []
+    for view, viewpoint in enumerate([*drive, *turned]):
+        rng = np.random.default_rng([*seed, 7, view])
+        radiance = render(viewpoint, int(rng.integers(2**30)))
+        photographs.append(take_photograph(scene, viewpoint, sensor, rng, radiance))
+    return photographs
 
 
 def picture(

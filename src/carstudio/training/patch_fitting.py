@@ -1,6 +1,7 @@
 """Fitting cars to their prepared patches: `fitting.optimise` with pixels of patches and our loss."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 
@@ -42,22 +43,37 @@ def fit_cars(
     """Latents, one row per car, that explain all its patches; they start at the mean of the encoded ones.
 
     `rays` pixels per patch and step, drawn by (seed, step, place of the patch among its car's), so that a car is shown
-    the same in any company. `stops_early` looks at pixels of the same patches that no step shows. Runs on the model's
-    device.
+    the same in any company. `stops_early` looks at patches that no step shows (`held_out_places`), or where a car has
+    none of these at other pixels of its patches. Runs on the model's device.
     """
     device = next(model.parameters()).device
-    patches = [patch for car in cars for patch in car]
-    places = [place for car in cars for place in range(len(car))]
-    owner = torch.cat([torch.full((len(car),), i) for i, car in enumerate(cars)]).to(device)
+    held = [held_out_places(len(car), config.hold_out_views) if stops_early else () for car in cars]
+    shown = [_Place(i, place) for i, car in enumerate(cars) for place in range(len(car)) if place not in held[i]]
+    looked_at = [_Place(i, place) for i, car in enumerate(cars) for place in held[i] or range(len(car))]
 
-    def draw(step: int, rays: int = rays) -> FitPixels:
-        generators = [generator_for(seed, step, "pixels", place) for place in places]
-        pixels = pixel_batch(patches, rays, generators).to(device)
+    def draw(step: int, places: Sequence[_Place] = shown, rays: int = rays) -> FitPixels:
+        generators = [generator_for(seed, step, "pixels", at.place) for at in places]
+        pixels = pixel_batch([cars[at.car][at.place] for at in places], rays, generators).to(device)
+        owner = torch.tensor([at.car for at in places], device=device)
         return FitPixels(pixels.rays, pixels.box, pixels.rgb, pixels.alpha, pixels.is_known, owner)
 
-    held_out = draw(config.steps, _HELD_OUT_RAYS) if stops_early else None  # of a step that is never made
+    # of a step that is never made
+    held_out = draw(config.steps, looked_at, _HELD_OUT_RAYS) if stops_early else None
     start = encode_cars(model, cars)
     return fit(model, start, draw, objective, config, held_out=held_out, watch=watch, report=report)
+
+
+class _Place(NamedTuple):
+    """A patch: the car's number and the patch's among that car's."""
+
+    car: int
+    place: int
+
+
+def held_out_places(num_patches: int, most: int) -> tuple[int, ...]:
+    """Which of a car's patches tell when to stop instead of being shown: `most` of them, evenly spread, never all."""
+    count = min(most, num_patches - 1)
+    return tuple((2 * i + 1) * num_patches // (2 * count) for i in range(count))
 
 
 @torch.no_grad()

@@ -20,14 +20,17 @@ import torch
 
 from carstudio.dataset.build import judge_and_split, summarize
 from carstudio.dataset.filters import FilterRecipe
+from carstudio.dataset.measured import azimuths_deg, measure
 from carstudio.dataset.outlines import crop_window
 from carstudio.dataset.patch import MaskValue, PatchRecord
 from carstudio.dataset.runs import is_made_already, write_run
+from carstudio.dataset.splits import kept_views, seen_from, split_by_drive
 from carstudio.dataset.store import StoreWriter, open_store
 from carstudio.dataset.summary import BuildSummary
 from carstudio.dataset.workers import ordered_map
 from carstudio.errors import InputError
 from carstudio.geometry.box3d import envelope
+from carstudio.geometry.orbit import NUM_TURNS
 from carstudio.geometry.overlap import box2d_iou
 from carstudio.geometry.transforms import quaternion_from_rotation
 from carstudio.images import encode_depth, encode_png
@@ -38,7 +41,7 @@ from carstudio.synthetic.cameras import CameraKind
 from carstudio.synthetic.cars import Car, draw_car
 from carstudio.synthetic.glb import load_glb
 from carstudio.synthetic.materials import Paint
-from carstudio.synthetic.photographs import Photograph, RayCaster, Renderer, draw_photographs
+from carstudio.synthetic.photographs import Photograph, RayCaster, Renderer, draw_photographs, photograph_drive
 
 __all__ = ["BuildSummary", "SynthConfig", "frozen_benchmark", "synthesize"]
 
@@ -64,6 +67,9 @@ class SynthConfig:
     """A GLB file or a folder of them (glTF axes: +Y up, +Z front; metres) instead of generated cars."""
     cameras: CameraKind = "mixed"
     """kitti: level, 1.65 m high, 6 to 22 m away; phone: pitched down by 5 to 15 degrees, nearer; mixed: both."""
+    tracks: bool = False
+    """Each car is a track: --views frames of one drive past it (KITTI's camera), and 18 true views of it turned where
+    it stands in steps of 360 / 19 degrees. Split `yaw`: the drive trains, sides that it did not see are tested."""
     renderer: Literal["embree", "mitsuba"] = "embree"
     """Who makes the colours. embree: a ray caster; mitsuba: path traced, more like photographs, some 20 times as slow
     (extra `photo`). Cameras, light and truth are the same."""
@@ -106,6 +112,9 @@ def synthesize(config: SynthConfig, report: Report = silent) -> BuildSummary:
                         writer.append(record)
                 report("photograph", done, config.cars, f"{len(writer)} photos")
         judge_and_split(writer, KEEP_ALL)
+        if config.tracks:
+            store = open_store(config.out, lock=writer.lock)
+            store.write_split("yaw", split_by_drive(seen_from(kept_views(store), azimuths_deg(measure(store)))))
     summary = summarize(open_store(config.out), source=SOURCE)
     return replace(summary, seconds=time.perf_counter() - start)
 
@@ -147,6 +156,8 @@ def _check(config: SynthConfig) -> None:
     for name, low in (("cars", 1), ("views", 1), ("seed", 0), ("workers", 0)):
         if getattr(config, name) < low:
             raise InputError(f"--{name} must be {low} or more, found {getattr(config, name)}")
+    if config.tracks and config.cameras == "phone":
+        raise InputError("--tracks are driven past by KITTI's camera; leave --cameras phone out")
     if not MIN_SIZE_PX <= config.size <= MAX_SIZE_PX:
         raise InputError(f"--size must be {MIN_SIZE_PX} to {MAX_SIZE_PX} px, found {config.size}")
 
@@ -175,6 +186,8 @@ def renderer_of(config: SynthConfig) -> Renderer:
 def _resume_key(config: SynthConfig, files: list[Path], renderer: Renderer) -> str:
     """What must be equal for an interrupted run to go on; more cars may be asked for than before."""
     settings = {k: v for k, v in asdict(config).items() if k not in ("out", "workers", "meshes", "cars")}
+    if not config.tracks:  # as before there were tracks: an interrupted run of then goes on
+        del settings["tracks"]
     settings["renderer"] = renderer.name
     settings["meshes"] = [hashlib.sha256(file.read_bytes()).hexdigest() for file in files]
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
@@ -185,8 +198,10 @@ def _num_workers(config: SynthConfig, num_cars: int) -> int:
 
 
 def patch_ids(config: SynthConfig, index: int) -> list[str]:
-    """Ids of a car's patches."""
-    return [f"{instance_id(config, index)}-{view:03d}" for view in range(config.views)]
+    """Ids of a car's patches: its views (or frames of the drive), then the car turned."""
+    car = instance_id(config, index)
+    turns = range(1, NUM_TURNS) if config.tracks else ()
+    return [f"{car}-{view:03d}" for view in range(config.views)] + [f"{car}-turned-{turn:02d}" for turn in turns]
 
 
 def instance_id(config: SynthConfig, index: int) -> str:
@@ -213,18 +228,18 @@ def car_records(
     With `repaint` the same photos of the same car in another colour: light, street, cameras and sensors are the same.
     """
     car, renderer = make_car(config, files, index, repaint), renderer or renderer_of(config)
-    photographs = draw_photographs(
-        car,
-        seed=(config.seed, index),
-        num_views=config.views,
-        size_px=config.size,
-        cameras=config.cameras,
-        renderer=renderer,
-    )
+    photographs = _photograph(config, car, index, renderer)
     return tuple(
         _record(config, car, view, photo, patch_id, renderer.name)
         for view, (photo, patch_id) in enumerate(zip(photographs, patch_ids(config, index), strict=True))
     )
+
+
+def _photograph(config: SynthConfig, car: Car, index: int, renderer: Renderer) -> list[Photograph]:
+    seed, views, size = (config.seed, index), config.views, config.size
+    if config.tracks:
+        return photograph_drive(car, seed=seed, num_frames=views, num_turns=NUM_TURNS, size_px=size, renderer=renderer)
+    return draw_photographs(car, seed=seed, num_views=views, size_px=size, cameras=config.cameras, renderer=renderer)
 
 
 def _record(config: SynthConfig, car: Car, view: int, photo: Photograph, patch_id: str, renderer: str) -> PatchRecord:
@@ -239,13 +254,14 @@ def _record(config: SynthConfig, car: Car, view: int, photo: Photograph, patch_i
     fx, fy, cx, cy = camera.intrinsics.tolist()
     is_upright = photo.viewpoint.kind == "kitti"
     rotation = quaternion_from_rotation(torch.tensor(photo.viewpoint.rotation, dtype=torch.float64))
-    car_id = patch_id.rpartition("-")[0]
+    car_id = "-".join(patch_id.split("-")[:3])
+    is_turned = view >= config.views
     return PatchRecord(
         patch_id=patch_id,
         instance_id=car_id,
         frame_id=patch_id,
-        sequence_id=car_id,
-        frame_index=view,
+        sequence_id=None if is_turned else car_id,
+        frame_index=None if is_turned else view,
         source=SOURCE,
         image=image,
         mask=encode_png(np.ascontiguousarray(mask)),
@@ -276,11 +292,11 @@ def _record(config: SynthConfig, car: Car, view: int, photo: Photograph, patch_i
         occlusion=0,
         licence=config.licence or ("unknown" if config.meshes else "CC0-1.0"),
         sha256=hashlib.sha256(image).hexdigest(),
-        extra=_extra(config, car, photo, renderer),
+        extra=_extra(config, car, photo, renderer, turns=view - config.views + 1 if is_turned else 0),
     )
 
 
-def _extra(config: SynthConfig, car: Car, photo: Photograph, renderer: str) -> str:
+def _extra(config: SynthConfig, car: Car, photo: Photograph, renderer: str, turns: int) -> str:
     view, light = photo.viewpoint, photo.light
     facts = {
         "style": car.style,
@@ -295,4 +311,6 @@ def _extra(config: SynthConfig, car: Car, photo: Photograph, renderer: str) -> s
     }
     if renderer != RayCaster().name:  # photos of the ray caster have no such entry: the frozen benchmark's bytes
         facts["renderer"] = renderer
+    if turns:
+        facts["turned_deg"] = round(360 * turns / NUM_TURNS, 3)
     return json.dumps(facts, sort_keys=True)
