@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from carstudio.report.plots import BLUE, INK, TEAL, bars, learning_curve, running_mean
+from carstudio.report.plots import BLUE, INK, TEAL, Point, bars, curves, learning_curve, running_mean
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -102,3 +102,19 @@ def test_the_same_figures_give_the_same_bytes_and_sound_svg() -> None:
         assert bars({"<a & b>": 1.5}, title="t", style=style) == bars({"<a & b>": 1.5}, title="t", style=style)
     root = ElementTree.fromstring(bars({"<a & b>": 1.5}, title="<t>", style="svg"))
     assert root.tag == f"{SVG}svg"
+
+
+def test_a_family_shares_a_colour_and_a_single_point_goes_all_across() -> None:
+    one, two = ([Point(x, value, value, value) for x in (1, 10, 100)] for value in (1.0, 2.0))
+    alone = [Point(1, 1.5, 1.5, 1.5)]
+    series = {"a: latents": one, "a: field": two, "b": alone}
+    picture = pixels(curves(series, title="PSNR", x="steps", families=("a", "a", "b")))
+    plot = picture[:, : round(0.75 * picture.shape[1])]  # the legend stands to the right
+    lines = is_colour(plot, BLUE)
+    in_rows = lines.sum(axis=1)
+    solid, dashed = in_rows[in_rows.argmax()], in_rows[: in_rows.argmax() - 40].max()  # 2.0 is the upper one
+    assert 0.5 * solid < dashed < 0.9 * solid
+    columns = np.flatnonzero(is_colour(plot, TEAL).any(axis=0))
+    assert np.ptp(columns) > np.ptp(np.flatnonzero(lines.any(axis=0))), "it reaches beyond the last point"
+    apart = pixels(curves(series, title="PSNR", x="steps"))
+    assert is_colour(apart, TEAL).sum() > 3 * is_colour(picture, TEAL).sum(), "without families each has its own"

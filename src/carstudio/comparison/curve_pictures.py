@@ -51,8 +51,9 @@ def pictures_of(
     found: Sequence[Curve], cars: Sequence[FittableCar], views: dict[str, str], cache: PatchCache
 ) -> tuple[tuple[str, str, Pixels], ...]:
     """File name, caption and picture of each; `views` is the held-out view of each car that is shown."""
+    families = [curve.row.name for curve in found]
     lines = {curve.title: _points(curve) for curve in found}
-    drawn = curves(lines, title="PSNR (dB) of held-out views", x="steps of fitting (+ 1)")
+    drawn = curves(lines, title="PSNR (dB) of held-out views", x="steps of fitting (+ 1)", families=families)
     before_after, strips = _before_after(found, cars, views, cache), named_rows(_strips(found, cars, cache))
     turned = "Turned by 360 / 19 degrees a step after fitting, beside the photo that begins the turn."
     return (
@@ -67,7 +68,6 @@ def _before_after(
 ) -> Pixels:
     """A line per model, a block of columns per car."""
     shown, names = cars[:SIDE_BY_SIDE], list(dict.fromkeys(curve.row.name for curve in found))
-    titles = [next(curve.row.title for curve in found if curve.row.name == name) for name in names]
     blank = np.full((TILE_PX[1], TILE_PX[0], 3), 255, np.uint8)
     rows = []
     for name in names:
@@ -81,7 +81,7 @@ def _before_after(
             row += [turned_photo(car, cache).rgb.numpy(), truth, *states.values()]
         rows.append(row)
     heads = ["fitted photo", "truth", *STATES] * len(shown)
-    return side_by_side(rows, heads=heads, captions=titles, tile_px=TILE_PX)
+    return side_by_side(rows, heads=heads, captions=names, tile_px=TILE_PX)
 
 
 def _states(curve: Curve, car: FittableCar) -> dict[str, Pixels]:

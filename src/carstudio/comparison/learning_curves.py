@@ -29,7 +29,7 @@ from carstudio.training.checkpoint import describe_model
 
 FIELD_RATES = {"car-gaussians": 3e-3}  # numbers of Gaussians bear larger steps than weights of a network
 USUAL_FIELD_RATE = 3e-4
-SHOWN_CARS = 3
+SHOWN_CARS, CARS_PER_BATCH = 3, 8
 
 
 def fitted_rows() -> list[Row]:
@@ -69,10 +69,12 @@ def make_learning_curves(work: Work, fit_work: Work, rows: Sequence[Row], budget
         trained, summary = train_row(where, replace(row, config=within(budget, row.config)))
         spent.append((row, summary))
         for mode in _modes(where, row, is_scratch):
+            with_field = mode in (FIELD, FIELD_ALONE)
             config = CurveConfig(
                 marks=(0,) if is_scratch else fitting.marks,
-                field_rate=FIELD_RATES.get(row.name, USUAL_FIELD_RATE) if mode in (FIELD, FIELD_ALONE) else 0.0,
+                field_rate=FIELD_RATES.get(row.name, USUAL_FIELD_RATE) if with_field else 0.0,
                 rays=rays,
+                cars_per_batch=1 if with_field else CARS_PER_BATCH,  # a field that cars share mixes their unseen sides
                 held_out_views=fitting.scored_views,
                 fitted_views=fitting.fitted_views,
                 split=fit_work.split,
@@ -86,9 +88,10 @@ def make_learning_curves(work: Work, fit_work: Work, rows: Sequence[Row], budget
     which = f"{fitted.path.name}, sha256 {fitted.data_sha256[:16]}, split {fit_work.split}: {len(cars)} cars"
     spent_on = "; ".join(f"{curve.row.name}, {curve.mode} {curve.cpu_seconds:,.0f}" for curve in found)
     about = (
-        *facts_of(work, spent, budget),
+        *(fact for fact in facts_of(work, spent, budget) if fact[0] != "scored"),
         ("fitted cars", which),
         ("fitting", f"{fitting} ({rays} rays of each photo)"),
+        ("field", "each car's own where it is fitted; NSG's is one for all cars, with a code for each"),
         ("cost of fitting", f"{spent_on} CPU-seconds"),
     )
     cache = PatchCache(fitted, 8)

@@ -21,7 +21,7 @@ GRID = "#7d859033"
 BLUE = "#3b82f6"
 TEAL = "#14a38b"
 AMBER = "#e8833a"
-LINES = (BLUE, TEAL, AMBER, INK, "#a855f7", "#e5484d")
+LINES = (BLUE, TEAL, AMBER, INK, "#a855f7", "#e5484d", "#8d6e63", "#db2777")
 PIXELS_PER_INCH = 160
 SMOOTHING = 0.9  # weight of the past in the running mean drawn over a noisy curve
 
@@ -74,23 +74,42 @@ class Point(NamedTuple):
 
 
 def curves(
-    series: Mapping[str, Sequence[Point]], *, title: str, x: str, style: PlotFormat = "png", ground: str = "white"
+    series: Mapping[str, Sequence[Point]],
+    *,
+    title: str,
+    x: str,
+    families: Sequence[str] = (),
+    style: PlotFormat = "png",
+    ground: str = "white",
 ) -> bytes:
-    """Lines through points with their intervals, over a logarithmic x axis; `ground` is the paper's colour."""
-    figure = Figure(figsize=(8.0, 3.4), layout="constrained", facecolor=ground)
+    """Lines through points with their intervals, over a logarithmic x axis; `ground` is the paper's colour.
+
+    Series of one family (one name per series) have its colour, all but its first are dashed. A single point among
+    longer series, to compare them with, is a dotted line all across.
+    """
+    figure = Figure(figsize=(8.0, max(3.4, 0.6 + 0.28 * len(series))), layout="constrained", facecolor=ground)
     axes = figure.subplots()
-    for number, (name, points) in enumerate(series.items()):
-        colour = LINES[number % len(LINES)]
-        errors = [[p.value - p.low for p in points], [p.high - p.value for p in points]]
-        axes.errorbar([p.x for p in points], [p.value for p in points], yerr=errors, color=colour, marker="o",
-                      capsize=3, linewidth=1.6, label=name)  # fmt: skip
+    family_of = dict(zip(series, families or series, strict=True))
+    order, longest = list(dict.fromkeys(family_of.values())), max(len(points) for points in series.values())
+    seen: set[str] = set()
+    for name, points in series.items():
+        family = family_of[name]
+        colour, line = LINES[order.index(family) % len(LINES)], "--" if family in seen else "-"
+        seen.add(family)
+        if len(points) < min(longest, 2):
+            axes.axhline(points[0].value, color=colour, linewidth=1.6, linestyle=":", label=name)
+            continue
+        values = [point.value for point in points]
+        axes.plot([point.x for point in points], values, line, color=colour, marker="o", markersize=4, linewidth=1.6,
+                  label=name)  # fmt: skip
+        axes.vlines([p.x for p in points], [p.low for p in points], [p.high for p in points], color=colour, alpha=0.35)
     axes.set_xscale("log")
     places = sorted({point.x for points in series.values() for point in points})
     axes.set_xticks(places, [f"{place:,.0f}" for place in places])
     axes.minorticks_off()
     dress(axes, title)
     axes.set_xlabel(x, color=INK, fontsize=9)
-    figure.legend(fontsize=8, frameon=False, labelcolor=INK, loc="outside right upper")
+    figure.legend(fontsize=8, frameon=False, labelcolor=INK, loc="outside right upper", handlelength=3.4)
     return figure_bytes(figure, style, is_transparent=False)
 
 
