@@ -39,7 +39,7 @@ RAW = {
 BOXES = {
     "scores": ("score_2d", 7e-5),
     "scores_3d": ("score_3d", 7e-5),
-    "quat": ("quaternion", 2e-4),
+    "quat": ("quaternion", 2e-4),  # of those that are kept; among all candidates some are nearly free to turn: x 3
     "proj_ctr": ("projected_center", 1.8e-2),
     "tvec": ("center", 1e-3),
     "size": ("size", 7e-4),
@@ -152,6 +152,7 @@ def assert_boxes(found: Detections, expected: Mapping[str, np.ndarray], prefix: 
         value, whole = getattr(found, ours).numpy(), expected[f"{prefix}_{theirs}"]
         if ours == "quaternion":  # q and -q are one rotation; w near 0 may take either sign
             whole = whole * np.sign((value * whole).sum(axis=1, keepdims=True))
+            tolerance *= 3 if prefix == "cand" else 1
         np.testing.assert_allclose(value, whole, atol=tolerance * factor, rtol=0, err_msg=f"{prefix} {theirs}")
 
 
