@@ -52,7 +52,7 @@ def terrain_of(scene: Scene) -> Terrain:
     by_frame: dict[int, list[np.ndarray]] = {}
     world: list[np.ndarray] = []
     frames = {frame.index: frame for frame in scene.frames}
-    for track in scene.tracks.values():
+    for _, track in sorted(scene.tracks.items()):  # sums round by their order, which is not to matter
         for index, box in track.boxes.items():
             if index not in track.labels or track.is_drawn_at(index):
                 continue
