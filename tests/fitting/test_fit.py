@@ -14,7 +14,7 @@ from carstudio.dataset.pixels import PatchCache, PreparedPatch
 from carstudio.dataset.store import PatchStore
 from carstudio.errors import InputError
 from carstudio.fitting.boxes import BoxFreedom
-from carstudio.fitting.car_file import load_car
+from carstudio.fitting.car_file import Car, load_car
 from carstudio.fitting.optimise import FitConfig, Fitted
 from carstudio.models.interface import CategoryModel
 from carstudio.training.batches import patch_batch
@@ -193,6 +193,25 @@ def test_the_verb_fits_all_cars_and_keeps_those_that_are_there(
     assert [a == b for a, b in zip(stamps, now, strict=True)] == [True, False, True]
     load_car(written[1].parent)
     assert car_folders(Path("o"), ["a/b", "a:b", "../x"]) == [Path("o/a_b-0"), Path("o/a_b-1"), Path("o/x")]
+
+
+def test_the_verb_gives_each_car_a_field_of_its_own(store: PatchStore, trained: Path, tmp_path: Path) -> None:
+    """A car is the same alone and with others, its weights too; only a batch that is asked for shares a field."""
+    names = cars(store)[:2]
+
+    def fitted(out: str, *more: str) -> dict[str, Car]:
+        command = ["fit", str(trained), "--data", str(store.path), "--out", str(tmp_path / out), "--device", "cpu"]
+        assert run([*command, "--steps", "3", "--field-rate", "1e-2", "--quiet", *more]) == 0
+        folders = [path.parent for path in sorted((tmp_path / out).rglob("car.json"))]
+        return {car.instance_id: car for car in map(load_car, folders)}
+
+    alone = fitted("alone", "--instance", names[1])[names[1]]
+    together = fitted("together", "--instance", *names)[names[1]]
+    shared = fitted("shared", "--instance", *names, "--cars-per-batch", "2")[names[1]]
+    assert alone.weights
+    for name, weight in alone.weights.items():
+        torch.testing.assert_close(together.weights[name], weight)
+    assert any(not torch.allclose(shared.weights[name], weight) for name, weight in alone.weights.items())
 
 
 def test_fitting_stops_when_held_out_pixels_get_no_better(store: PatchStore, trained: Path) -> None:

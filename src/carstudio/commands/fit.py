@@ -20,6 +20,7 @@ from carstudio.training.checkpoint import describe_model, load_model
 from carstudio.training.patch_fitting import fit_cars, held_out_places
 
 ALL = "all"
+CARS_PER_BATCH = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,8 +43,9 @@ class Fit(Output):
     """How they are fitted."""
     rays: int = 256
     """Pixels per photograph and step."""
-    cars_per_batch: int = 8
-    """Cars fitted at a time; where the field is fitted too, they share it."""
+    cars_per_batch: int | None = None
+    """Cars fitted at a time: 8 when absent, or 1 where the field is fitted too, since the cars of a batch share it (as
+    the paper does with those of one log) and mix their unseen sides."""
     seed: int = 0
     """Which pixels."""
     device: str = "auto"
@@ -55,10 +57,9 @@ class Fit(Output):
 
     def run(self) -> Outcome:
         """Encode, fit, write."""
-        if self.rays < 1 or self.cars_per_batch < 1:
-            raise InputError(
-                f"--rays and --cars-per-batch must be at least 1, found {self.rays} and {self.cars_per_batch}"
-            )
+        at_once = self._at_once()
+        if self.rays < 1 or at_once < 1:
+            raise InputError(f"--rays and --cars-per-batch must be at least 1, found {self.rays} and {at_once}")
         model, store = load_model(self.model, device=pick_device(self.device)), open_store(self.data)
         if not model.is_coded:
             raise InputError(f"{self.model}: looks cars up in their photos and has no codes to keep in a file")
@@ -70,13 +71,18 @@ class Fit(Output):
         told = [self._told(folders[name], load_car(folders[name])) for name in names if name not in missing]
         cache = PatchCache(store, model.encoder_side_px)
         with self.progress() as report:
-            for first in range(0, len(missing), self.cars_per_batch):
-                batch = missing[first : first + self.cars_per_batch]
+            for first in range(0, len(missing), at_once):
+                batch = missing[first : first + at_once]
                 told += self._fit(model, store, cache, {n: (photos[n], folders[n]) for n in batch}, report)
                 report("cars", first + len(batch), len(missing), "")
         told.sort(key=lambda value: folders_in_order(folders, value["out"]))
         text = "\n".join(_line(value) for value in told)
         return Outcome(text, told[0] if len(told) == 1 else {"out": str(self.out), "cars": told})
+
+    def _at_once(self) -> int:
+        if self.cars_per_batch is not None:
+            return self.cars_per_batch
+        return 1 if self.config.field_rate else CARS_PER_BATCH
 
     def _fit(
         self,
@@ -134,7 +140,7 @@ class Fit(Output):
         )
 
     def _settings(self) -> str:
-        return repr((self.config, self.rays, self.seed, self.cars_per_batch if self.config.field_rate else None))
+        return repr((self.config, self.rays, self.seed, self._at_once() if self.config.field_rate else None))
 
     def _is_there(self, folder: Path, patch_ids: list[str]) -> bool:
         """Whether the very car was written by an earlier run."""
@@ -162,7 +168,7 @@ def folders_in_order(folders: dict[str, Path], out: str) -> int:
 def _line(told: dict[str, Any]) -> str:
     text = f"{told['out']}: {told['instance_id']} from {len(told['patches'])} photographs, {told['steps']} steps"
     curve = told["held_out_loss"]
-    return text + (f"; loss on held-out pixels {curve[0][1]:.4f} -> {min(v for _, v in curve):.4f}" if curve else "")
+    return text + (f"; held-out loss {curve[0][1]:.4f} -> {min(v for _, v in curve):.4f}" if curve else "")
 
 
 def _box_value(fitted: Fitted, row: int) -> dict[str, list[Any]]:
