@@ -63,12 +63,15 @@ def car_nerf_small() -> TrainConfig:
 
 
 def car_gaussians() -> TrainConfig:
-    """Gaussians in the car's box, for quality and speed: 512 in mirrored pairs, photos mirrored half the time."""
+    """Gaussians in the car's box, for quality and speed: 512 in mirrored pairs, photos laid out on the box's faces."""
+    encoder = EncoderConfig(kind="box-faces", side_px=64, pretrained=None, num_features=256, sees_mask=True)
     return TrainConfig(
         recipe="car-gaussians",
-        model=CarGaussiansConfig(),
+        model=CarGaussiansConfig(encoder=encoder, code_size=256, width=512, blocks=1),
         loss=LossConfig(colour="whole-crop", mask_weight=0.3, exposed_share=0.5, photo_error="log"),
-        schedule=ScheduleConfig(first=5e-3, last=1e-4, decay_steps=None, warmup_steps=100),
+        schedule=ScheduleConfig(first=3e-4, last=3e-6, decay="linear", decay_steps=None, warmup_steps=100),
+        optimizer="adam",
+        template_rate=20.0,
         supervision="mixed",
         mirroring="together",
         patches_per_step=32,
@@ -82,7 +85,8 @@ def car_gaussians() -> TrainConfig:
 def car_gaussians_preview() -> TrainConfig:
     """The same with 256 Gaussians: a car to look at after a minute or two."""
     config = car_gaussians()
-    model = CarGaussiansConfig(num_splats=256, splatting=SplattingConfig(most=24))
+    assert isinstance(config.model, CarGaussiansConfig)
+    model = replace(config.model, num_splats=256, splatting=SplattingConfig(most=24))
     return replace(config, recipe="car-gaussians-preview", model=model, steps=2_000)
 
 

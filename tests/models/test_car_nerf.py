@@ -1,3 +1,5 @@
+import dataclasses
+
 import pytest
 import torch
 
@@ -61,12 +63,15 @@ def test_resnet_features_are_the_papers_512_and_follow_the_photo() -> None:
     torch.manual_seed(0)
     encoder = CarNeRF(car_nerf().model).encoder.eval()
     image = torch.rand(2, 3, 128, 128)
-    features = encoder(image, torch.zeros(2, 128, 128))
+    patches = dataclasses.replace(batch(2), image=image, mask=torch.zeros(2, 128, 128))
+    features = encoder(patches)
     assert features.shape == (2, 512)
     # the first 64 are the stem's maxima over the image: an independent computation
     stem = torch.relu(encoder.embedder.normalization(encoder.embedder.convolution((image - 0.5) / 0.5)))
     assert torch.allclose(features[:, :64], stem.flatten(2).amax(dim=-1), atol=1e-5)
-    assert torch.allclose(encoder(image[:1], torch.zeros(1, 128, 128))[0], features[0], atol=1e-4)
+    assert torch.allclose(
+        encoder(dataclasses.replace(batch(1), image=image[:1], mask=patches.mask[:1]))[0], features[0], atol=1e-4
+    )
 
 
 def test_texture_leaves_density_bit_identical() -> None:

@@ -9,7 +9,10 @@ from torch import Tensor, nn
 from transformers import ResNetConfig, ResNetModel
 
 from carstudio.errors import InputError
+from carstudio.geometry.box3d import Box3D
+from carstudio.geometry.camera import Camera
 from carstudio.models.encoders import EncoderConfig, ResNet34Encoder, build_encoder, load_imagenet
+from carstudio.models.interface import PatchBatch
 
 
 def save_resnet(folder: Path, **changes: object) -> ResNetModel:
@@ -24,6 +27,14 @@ def save_resnet(folder: Path, **changes: object) -> ResNetModel:
             nn.init.normal_(module.running_mean, std=0.1)
     model.save_pretrained(folder)
     return model.eval()
+
+
+def photos(image: Tensor) -> PatchBatch:
+    """Pictures as encoders get them; nothing but the picture matters to these."""
+    count, side = len(image), image.shape[-1]
+    box = Box3D(torch.zeros(count, 3), torch.ones(count, 3), torch.eye(3).expand(count, 3, 3))
+    camera = Camera(torch.ones(count, 4), side, side)
+    return PatchBatch(image, torch.zeros(count, side, side), camera, box, ("a",) * count)
 
 
 def features_by_transformers(model: ResNetModel, image: Tensor) -> Tensor:
@@ -49,11 +60,11 @@ def test_weights_and_features_are_those_of_the_saved_model(tmp_path: Path) -> No
     theirs = save_resnet(tmp_path)
     config = EncoderConfig(pretrained=str(tmp_path))
     ours = build_encoder(config)
-    before = ours(torch.zeros(1, 3, 64, 64), torch.zeros(1, 64, 64))
+    before = ours(photos(torch.zeros(1, 3, 64, 64)))
     assert load_imagenet(ours, config) == f"ImageNet weights of {tmp_path}"
     ours.eval()
     image = torch.rand(2, 3, 64, 64)
-    features = ours(image, torch.zeros(2, 64, 64))
+    features = ours(photos(image))
     assert features.shape == (2, 512)
     assert not torch.allclose(before, features[:1])
     # the same float32 operations; only the order of sums may differ

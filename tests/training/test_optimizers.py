@@ -10,7 +10,9 @@ import torch
 from carstudio.commands.train import Train
 from carstudio.dataset.store import PatchStore
 from carstudio.errors import InputError
+from carstudio.models.car_gaussians import CarGaussiansConfig
 from carstudio.models.code_nerf import CodeNeRFConfig
+from carstudio.models.encoders import EncoderConfig
 from carstudio.models.interface import CategoryModel, Latents
 from carstudio.models.zoo import build_model
 from carstudio.rendering.field import SamplingConfig
@@ -78,6 +80,22 @@ def test_codes_learn_at_their_own_rate() -> None:
         expected = 1e-2 if name.endswith("_codes") else 1e-3
         assert torch.allclose(moved, torch.full_like(moved, expected), rtol=1e-3), name
     assert sum(len(group["params"]) for group in optimizer.param_groups) == len(before)
+
+
+def test_a_templates_numbers_learn_at_their_own_rate() -> None:
+    torch.manual_seed(0)
+    encoder = EncoderConfig(kind="small", side_px=32, pretrained=None, num_features=8)
+    model = build_model(CarGaussiansConfig(encoder=encoder, num_splats=16, code_size=8, width=8, blocks=1))
+    before = {name: value.detach().clone() for name, value in model.named_parameters()}
+    optimizer = build_optimizer(model, "adam", rate=1e-3, template_rate=20.0)
+    for parameter in model.parameters():
+        parameter.grad = torch.full_like(parameter, 0.3)
+    optimizer.step()
+    own = {name for name, _ in model.field_parameters()}
+    assert len(own) == 7
+    for name, value in model.named_parameters():
+        moved = (before[name] - value).abs()
+        assert torch.allclose(moved, torch.full_like(moved, 2e-2 if name in own else 1e-3), rtol=1e-3), name
 
 
 @pytest.mark.parametrize(

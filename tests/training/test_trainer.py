@@ -197,6 +197,10 @@ def test_schedules() -> None:
     assert learning_rate(small, 0, 0.0) == pytest.approx(2e-4)
     assert learning_rate(small, 9, 0.0) == pytest.approx(2e-3)
     assert learning_rate(small, 500, 0.5) == pytest.approx(math.sqrt(2e-3 * 2e-4))
+    line = dataclasses.replace(small, decay="linear")
+    assert learning_rate(line, 0, 0.0) == pytest.approx(2e-4)
+    assert learning_rate(line, 500, 0.5) == pytest.approx(1.1e-3)
+    assert learning_rate(line, 999, 1.0) == pytest.approx(2e-4)
 
 
 def test_a_run_may_start_from_another_runs_weights(store: PatchStore, tmp_path: Path) -> None:

@@ -40,6 +40,8 @@ class CarGaussiansConfig:
     """Length of each of the two codes."""
     width: int = 256
     """Hidden width of the two decoders."""
+    blocks: int = 0
+    """Residual blocks of each decoder after its first layer."""
     is_symmetric: bool = True
     """Gaussians come in pairs mirrored in the car's middle plane; colours are free."""
     colour_skip_px: int = 8
@@ -87,13 +89,17 @@ class CarGaussians(CategoryModel):
         own = {*template, "geometry.offsets.bias", "colour.colours.bias", "colour.tint.1.bias"}
         return [(name, parameter) for name, parameter in self.named_parameters() if name in own]
 
+    def template_parameters(self) -> tuple[nn.Parameter, ...]:
+        """The same numbers: what all cars have in common."""
+        return tuple(parameter for _, parameter in self.field_parameters())
+
     def colour_parameters(self) -> list[tuple[str, nn.Parameter]]:
         """The last biases of the colour decoder."""
         return [(name, parameter) for name, parameter in self.field_parameters() if name.startswith("colour.")]
 
     def encode(self, patches: PatchBatch) -> Latents:
         """Codes of shape and texture."""
-        features = torch.cat([self.encoder(patches.image, patches.mask), pose_features(patches)], dim=-1)
+        features = torch.cat([self.encoder(patches), pose_features(patches)], dim=-1)
         texture = self.texture_head(features)
         if self.config.colour_skip_px:
             texture = texture + self.colour_skip(tiny_masked_copy(patches, self.config.colour_skip_px))
@@ -128,6 +134,27 @@ def _exact(latents: Latents, rays: Rays) -> Latents:
     return Latents(latents.shape.to(rays.directions.dtype), latents.texture.to(rays.directions.dtype))
 
 
+def _hidden_layers(num_inputs: int, config: CarGaussiansConfig) -> nn.Sequential:
+    """From a code to what the last layers of a decoder are linear in."""
+    blocks = [ResidualLayers(config.width) for _ in range(config.blocks)]
+    return nn.Sequential(nn.Linear(num_inputs, config.width), nn.SiLU(), *blocks)
+
+
+class ResidualLayers(nn.Module):
+    """x + f(x) with two linear layers, twice as wide between them; f starts at 0."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        last = nn.Linear(2 * width, width)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        self.change = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.SiLU(), last)
+
+    def forward(self, x: Float[Tensor, "batch width"]) -> Float[Tensor, "batch width"]:
+        """As the class says."""
+        return x + self.change(x)
+
+
 OFFSETS = {"mean": 3, "log_scale": 3, "quaternion": 4, "opacity": 1}
 
 
@@ -138,7 +165,7 @@ class GeometryDecoder(nn.Module):
         super().__init__()
         self.config = config
         count = config.num_splats // 2 if config.is_symmetric else config.num_splats
-        self.hidden = nn.Sequential(nn.Linear(config.code_size, config.width), nn.SiLU())
+        self.hidden = _hidden_layers(config.code_size, config)
         self.offsets = nn.Linear(config.width, count * sum(OFFSETS.values()))
         nn.init.normal_(self.offsets.weight, std=0.02 / config.width**0.5)
         nn.init.zeros_(self.offsets.bias)
@@ -180,7 +207,7 @@ class ColourDecoder(nn.Module):
     def __init__(self, config: CarGaussiansConfig) -> None:
         super().__init__()
         self.config = config
-        self.hidden = nn.Sequential(nn.Linear(2 * config.code_size, config.width), nn.SiLU())
+        self.hidden = _hidden_layers(2 * config.code_size, config)
         self.colours = nn.Linear(config.width, config.num_splats * 3)
         if config.tint_width:
             last = nn.Linear(config.tint_width, config.num_splats * 9)

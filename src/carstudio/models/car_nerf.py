@@ -82,7 +82,7 @@ class CarNeRF(FieldModel):
 
     def encode(self, patches: PatchBatch) -> Latents:
         """z_shape and z_texture of each patch."""
-        features = self.encoder(patches.image, patches.mask)
+        features = self.encoder(patches)
         if self.config.encode_pose:
             features = torch.cat([features, pose_features(patches)], dim=-1)
         texture = self.texture_head(features)

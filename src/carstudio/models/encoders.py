@@ -15,6 +15,8 @@ from torch import Tensor, nn
 
 from carstudio.errors import InputError
 from carstudio.hub import load_from_hub
+from carstudio.models.box_faces import CHANNELS, box_faces
+from carstudio.models.interface import PatchBatch
 
 logger = logging.getLogger(__name__)
 
@@ -28,9 +30,10 @@ DEPTHS, WIDTHS = [3, 4, 6, 3], [64, 128, 256, 512]  # of ResNet-34
 class EncoderConfig:
     """Which encoder turns the crop into features."""
 
-    kind: Literal["resnet34", "small", "small-pyramid"] = "resnet34"
+    kind: Literal["resnet34", "small", "small-pyramid", "box-faces"] = "resnet34"
     """"resnet34": the paper's; "small": a few convolutions, 4 ms a patch on one core; "small-pyramid": as resnet34 is
-    built, stages up-sampled and joined, of a few convolutions (small rows of the tables)."""
+    built, stages up-sampled and joined, of a few convolutions (small rows of the tables); "box-faces": a few
+    convolutions on the photo laid out on the faces of the car's box, which always sees the mask."""
     side_px: int = 128
     """Side of the square the crop is resized to (released: 128)."""
     pretrained: str | None = RESNET34_HUB_NAME
@@ -38,7 +41,7 @@ class EncoderConfig:
     num_features: int = 512
     """Length of the feature vector (512 for resnet34 and 320 for small-pyramid, fixed)."""
     sees_mask: bool = False
-    """Also feed the mask as a fourth channel (small only; the paper's encoder sees the photo alone)."""
+    """Also feed the mask as a fourth channel ("small"; the paper's encoder sees the photo alone)."""
 
     def __post_init__(self) -> None:
         if self.kind == "resnet34":
@@ -47,6 +50,9 @@ class EncoderConfig:
         if self.kind == "small-pyramid":
             assert self.num_features == SMALL_PYRAMID_FEATURES, "small-pyramid gives 320 features"
             assert not self.sees_mask, "small-pyramid sees the photo alone"
+        if self.kind == "box-faces":
+            assert self.sees_mask, "box-faces sees the mask"
+            assert self.side_px % 2 ** len(SMALL_CHANNELS) == 0, "box-faces needs a side of a multiple of 16 px"
 
 
 class ResNet34Encoder(nn.Module):
@@ -78,11 +84,9 @@ class ResNet34Encoder(nn.Module):
         for ours, theirs in zip(self.stages, loaded.encoder.stages[:3], strict=True):
             ours.load_state_dict(theirs.state_dict())
 
-    def forward(
-        self, image: Float[Tensor, "batch 3 side side"], mask: Float[Tensor, "batch side side"]
-    ) -> Float[Tensor, "batch 512"]:
-        """Global features: the map's maxima. `mask` is ignored, as in the paper."""
-        return self.feature_map(image).amax(dim=(-2, -1))
+    def forward(self, patches: PatchBatch) -> Float[Tensor, "batch 512"]:
+        """Global features: the map's maxima. The mask is ignored, as in the paper."""
+        return self.feature_map(patches.image).amax(dim=(-2, -1))
 
     def feature_map(self, image: Float[Tensor, "batch 3 side side"]) -> Float[Tensor, "batch 512 rows columns"]:
         """Features at half the photo's resolution, for models that look up single pixels."""
@@ -112,11 +116,9 @@ class SmallPyramid(nn.Module):
             for inside, outside in pairs
         )
 
-    def forward(
-        self, image: Float[Tensor, "batch 3 side side"], mask: Float[Tensor, "batch side side"]
-    ) -> Float[Tensor, "batch feature"]:
-        """Global features: the map's maxima. `mask` is ignored."""
-        return self.feature_map(image).amax(dim=(-2, -1))
+    def forward(self, patches: PatchBatch) -> Float[Tensor, "batch feature"]:
+        """Global features: the map's maxima. The mask is ignored."""
+        return self.feature_map(patches.image).amax(dim=(-2, -1))
 
     def feature_map(self, image: Float[Tensor, "batch 3 side side"]) -> Float[Tensor, "batch feature rows columns"]:
         """Features at half the photo's resolution."""
@@ -131,29 +133,69 @@ class SmallEncoder(nn.Module):
 
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
-        channels = [4 if config.sees_mask else 3, *SMALL_CHANNELS]
-        layers: list[nn.Module] = []
-        for inside, outside in pairwise(channels):
-            layers += [nn.Conv2d(inside, outside, 3, stride=2, padding=1), nn.GroupNorm(8, outside), nn.SiLU()]
-        self.convolutions = nn.Sequential(*layers, nn.AdaptiveAvgPool2d(4), nn.Flatten())
-        self.linear = nn.Linear(channels[-1] * 16, config.num_features)
+        shrinking = _shrinking(4 if config.sees_mask else 3)
+        self.convolutions = nn.Sequential(*shrinking, nn.AdaptiveAvgPool2d(4), nn.Flatten())
+        self.linear = nn.Linear(SMALL_CHANNELS[-1] * 16, config.num_features)
         self.sees_mask = config.sees_mask
 
-    def forward(
-        self, image: Float[Tensor, "batch 3 side side"], mask: Float[Tensor, "batch side side"]
-    ) -> Float[Tensor, "batch feature"]:
+    def forward(self, patches: PatchBatch) -> Float[Tensor, "batch feature"]:
         """Features of the crop (and of the mask where the config says so)."""
-        pixels = (image - 0.5) / 0.5
+        pixels = (patches.image - 0.5) / 0.5
         if self.sees_mask:
-            pixels = torch.cat([pixels, mask[:, None]], dim=1)
+            pixels = torch.cat([pixels, patches.mask[:, None]], dim=1)
         return nn.functional.silu(self.linear(self.convolutions(pixels)))
+
+
+class BoxFacesEncoder(nn.Module):
+    """The same on the photo laid out on the faces of the box, with a residual block at the end."""
+
+    def __init__(self, config: EncoderConfig) -> None:
+        super().__init__()
+        self.side_px = config.side_px
+        last = SMALL_CHANNELS[-1]
+        self.convolutions = nn.Sequential(*_shrinking(CHANNELS), ResidualConvolutions(last), nn.Flatten())
+        self.linear = nn.Linear(last * (config.side_px // 2 ** len(SMALL_CHANNELS)) ** 2, config.num_features)
+
+    def forward(self, patches: PatchBatch) -> Float[Tensor, "batch feature"]:
+        """Features of the faces that the camera sees."""
+        return nn.functional.silu(self.linear(self.convolutions(box_faces(patches, self.side_px))))
+
+
+def _shrinking(channels: int) -> list[nn.Module]:
+    """Convolutions that halve the side each, from `channels` through `SMALL_CHANNELS`."""
+    layers: list[nn.Module] = []
+    for inside, outside in pairwise((channels, *SMALL_CHANNELS)):
+        layers += [nn.Conv2d(inside, outside, 3, stride=2, padding=1), nn.GroupNorm(8, outside), nn.SiLU()]
+    return layers
+
+
+class ResidualConvolutions(nn.Module):
+    """x + f(x) with two convolutions; f starts at 0."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.change = nn.Sequential(
+            *(nn.GroupNorm(8, channels), nn.SiLU(), nn.Conv2d(channels, channels, 3, padding=1)),
+            *(nn.GroupNorm(8, channels), nn.SiLU(), nn.Conv2d(channels, channels, 3, padding=1)),
+        )
+        last = self.change[-1]
+        assert isinstance(last, nn.Conv2d)
+        assert last.bias is not None
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+
+    def forward(self, x: Float[Tensor, "batch channel rows columns"]) -> Float[Tensor, "batch channel rows columns"]:
+        """As the class says."""
+        return x + self.change(x)
 
 
 def build_encoder(config: EncoderConfig) -> nn.Module:
     """The encoder a config names, with random weights (`load_imagenet` replaces them)."""
     if config.kind == "resnet34":
         return ResNet34Encoder()
-    return SmallPyramid() if config.kind == "small-pyramid" else SmallEncoder(config)
+    if config.kind == "small-pyramid":
+        return SmallPyramid()
+    return BoxFacesEncoder(config) if config.kind == "box-faces" else SmallEncoder(config)
 
 
 def load_imagenet(encoder: nn.Module, config: EncoderConfig) -> str:

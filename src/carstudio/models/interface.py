@@ -93,6 +93,10 @@ class CategoryModel(nn.Module):
         """Parameters that are codes of the cars trained on (auto-decoders); they may learn at a rate of their own."""
         return ()
 
+    def template_parameters(self) -> tuple[nn.Parameter, ...]:
+        """Parameters that are a mean car's own numbers, no network's weights; they may learn at a rate of their own."""
+        return ()
+
     def field_parameters(self) -> list[tuple[str, nn.Parameter]]:
         """What fitting a car may change beside its latents: all that acts after encoding, unless a model says less."""
         encoding = ("encoder.", "shape_head.", "texture_head.", "shape_norm.", "texture_norm.", "colour_skip.")

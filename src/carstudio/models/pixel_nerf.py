@@ -74,7 +74,7 @@ class PixelNeRF(FieldModel):
         """The feature map with the camera and box it is looked up by; or its maxima as the shape code."""
         nothing = patches.image.new_zeros(len(patches.image), 0)
         if self.config.features == "global":
-            return Latents(self.encoder(patches.image, patches.mask), nothing)
+            return Latents(self.encoder(patches), nothing)
         found: Tensor = self.encoder.feature_map(patches.image)  # type: ignore[operator]
         return Latents(nothing, nothing, PixelFeatures(found, patches.camera, patches.box))
 

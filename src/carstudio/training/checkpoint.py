@@ -28,6 +28,7 @@ LIMITS = {
     "depth": (1, 256),
     "skip_after": (0, 256),
     "colour_skip_px": (0, 256),
+    "blocks": (0, 64),
     "most": (1, 16_384),
     "tint_width": (0, 16_384),
     "position_frequencies": (1, 32),

@@ -42,6 +42,8 @@ class TrainConfig:
     """radam: the paper's; adamw: CodeNeRF's; adam: one fused kernel, the least work per step."""
     code_rate: float = 1.0
     """Learning rate of codes that are kept per car (CodeNeRF), as a multiple of the schedule's."""
+    template_rate: float = 1.0
+    """Learning rate of a mean car's own numbers (car-gaussians), as a multiple of the schedule's."""
     most_cars: int | None = None
     """Train on so many of the split's cars only; fewer are always among the more. None: on all."""
     least_views: int = 1

@@ -11,19 +11,21 @@ EPSILON = 1e-8  # the paper's
 
 
 def build_optimizer(
-    model: CategoryModel, name: OptimizerName, *, rate: float, code_rate: float = 1.0
+    model: CategoryModel, name: OptimizerName, *, rate: float, code_rate: float = 1.0, template_rate: float = 1.0
 ) -> torch.optim.Optimizer:
     """The optimiser over a model's parameters; each group's `multiple` times the schedule's rate is its rate.
 
     RAdam with the paper's epsilon, AdamW with torch's weight decay of 0.01 (as CodeNeRF's code), or Adam in one fused
     kernel. All keep the same state per parameter.
     """
-    codes = {id(parameter) for parameter in model.code_parameters()}
+    own = [(model.code_parameters(), code_rate), (model.template_parameters(), template_rate)]
+    ids = {id(parameter) for parameters, _ in own for parameter in parameters}
     groups: list[dict[str, Any]] = [
-        {"params": [p for p in model.parameters() if id(p) not in codes], "multiple": 1.0, "lr": rate}
+        {"params": [p for p in model.parameters() if id(p) not in ids], "multiple": 1.0, "lr": rate}
     ]
-    if codes:
-        groups.append({"params": list(model.code_parameters()), "multiple": code_rate, "lr": rate * code_rate})
+    for parameters, multiple in own:
+        if parameters:
+            groups.append({"params": list(parameters), "multiple": multiple, "lr": rate * multiple})
     if name == "radam":
         return torch.optim.RAdam(groups, lr=rate, eps=EPSILON)
     if name == "adamw":

@@ -167,7 +167,11 @@ class _Run:
         self.model = build_model(self.model_config).to(device)
         self.starts_from = ""
         self.optimizer = build_optimizer(
-            self.model, config.optimizer, rate=config.schedule.first, code_rate=config.code_rate
+            self.model,
+            config.optimizer,
+            rate=config.schedule.first,
+            code_rate=config.code_rate,
+            template_rate=config.template_rate,
         )
         self.step, self.seconds, self.cpu_seconds, self.psnr, self.rays_per_s = 0, 0.0, 0.0, math.nan, 0.0
         self.is_stopped = False
