@@ -1,4 +1,4 @@
-"""`carstudio models list|download|convert`: pretrained networks, where they are, how to bring them here."""
+"""`carstudio models list|download|convert|halve`: pretrained networks, which are here, bringing and passing on."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,17 +17,18 @@ from carstudio.perception.weights import ENCODER_OPTION, KNOWN_MODELS, full_name
 
 @dataclass(frozen=True, kw_only=True)
 class Models(Output):
-    """Show which pretrained networks are on this machine, download some of the hub, or convert a public checkpoint."""
+    """Show which pretrained networks are here, download some of the hub, convert a public checkpoint, halve a model."""
 
-    action: tyro.conf.Positional[Literal["list", "download", "convert"]]
+    action: tyro.conf.Positional[Literal["list", "download", "convert", "halve"]]
     """list: the networks we know, and whether they are here; with folders: loads each and says how to use it.
-    download: fetch networks of the hub. convert: make a public checkpoint (dd3d CHECKPOINT.pth) a folder of ours."""
+    download: fetch networks of the hub. convert: make a public checkpoint (dd3d CHECKPOINT.pth) a folder of ours.
+    halve: write a trained model of `carstudio train` with weights of half the size."""
     names: tyro.conf.Positional[tuple[str, ...]] = ()
     """download: names as on the hub (facebook/sam-vit-huge), or without the owner where we know them. list: folders.
-    convert: what it is, and the file: dd3d CHECKPOINT.pth."""
+    convert: what it is, and the file: dd3d CHECKPOINT.pth. halve: the run's folder."""
     out: Path | None = None
     """download: a folder to carry elsewhere (with several names one folder below it for each), not the hub's cache.
-    convert: the folder to write."""
+    convert, halve: the folder to write."""
 
     def saved(self) -> str:
         """Whole files are kept, and the part of the one that was on its way."""
@@ -41,6 +42,8 @@ class Models(Output):
             return check_folders(self.names) if self.names else list_models()
         if self.action == "convert":
             return convert_checkpoint(self.names, self.out)
+        if self.action == "halve":
+            return halve(self.names, self.out)
         if not self.names:
             raise InputError("download needs a name, such as sam-vit-huge; `carstudio models list` shows them")
         names = [full_name(name) for name in self.names]
@@ -75,6 +78,22 @@ def convert_checkpoint(names: tuple[str, ...], out: Path | None) -> Outcome:
         f"{made.num_bytes / 1e6:.0f} MB; use it with --box3d {MODEL_TYPE}:{made.folder}"
     )
     return Outcome(text, {"converted": plain(made)})
+
+
+def halve(names: tuple[str, ...], out: Path | None) -> Outcome:
+    """`halve RUN --out FOLDER`."""
+    from carstudio.training.checkpoint import WEIGHTS, halve_model
+
+    if len(names) != 1 or out is None:
+        raise InputError(
+            f"halve: expected RUN --out FOLDER, found {' '.join(names) or 'nothing'}{'' if out else ' without --out'}"
+        )
+    checksum = halve_model(Path(names[0]).expanduser(), out)
+    num_bytes = (out / WEIGHTS).stat().st_size
+    text = (
+        f"{out}: {num_bytes / 1e6:.1f} MB of float16 weights (sha256 {checksum[:16]}); use it wherever the run would do"
+    )
+    return Outcome(text, {"folder": str(out), "sha256": checksum, "num_bytes": num_bytes})
 
 
 def known_models() -> list[dict[str, Any]]:

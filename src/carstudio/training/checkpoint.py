@@ -1,6 +1,7 @@
 """Models on disk: `model.safetensors` + `model.json`; nothing is ever unpickled.
 
-`model.json` holds format version, model config, provenance and the sha256 of the weights beside it.
+`model.json` holds format version, model config, provenance and the sha256 of the weights beside it. Weights may be
+stored as float16 (`halve_model`), as those that come with the package are; a model computes with float32 all the same.
 """
 
 from collections.abc import Iterable
@@ -122,6 +123,24 @@ def _sizes_beyond(value: Any, name: str) -> list[str]:
     return [] if least <= value <= most else [f"{name} = {value} must lie between {least} and {most}"]
 
 
+def halve_model(folder: Path | str, out: Path) -> str:
+    """A trained model again with its weights rounded to float16, half the size, to pass on; returns their sha256.
+
+    Rounding moves a weight by 1 in 2,048 of itself at most. `InputError` where `out` holds a model, or a weight is too
+    large for float16.
+    """
+    folder = find_model(folder)
+    description = describe_model(folder)
+    if (out / DESCRIPTION).exists() or (out / WEIGHTS).exists():
+        raise InputError(f"{out} holds a model already; choose another --out")
+    model = load_model(folder)
+    for name, tensor in model.state_dict().items():
+        if tensor.is_floating_point() and not bool(tensor.half().isfinite().all()):
+            raise InputError(f"{folder}: {name} holds numbers beyond float16's 65,504; keep the model as it is")
+    provenance = {**description.provenance, "weights": f"those of sha256 {description.sha256}, rounded to float16"}
+    return save_model(out, model.half(), description.config, provenance)
+
+
 def load_weights_of(folder: Path, model: CategoryModel, config: ModelConfig) -> str:
     """Give `model` the weights of another run of the same model config; says in words what it now starts from."""
     folder = find_model(folder)
@@ -151,7 +170,8 @@ def _check_names_and_shapes(expected: dict[str, torch.Tensor], tensors: dict[str
     if missing or extra:
         raise InputError(f"{name}: weights of another model: missing {missing[:4]}, left over {extra[:4]}")
     for key, tensor in tensors.items():
-        if tensor.shape != expected[key].shape or tensor.dtype != expected[key].dtype:
+        kinds = (expected[key].dtype, torch.float16) if expected[key].dtype == torch.float32 else (expected[key].dtype,)
+        if tensor.shape != expected[key].shape or tensor.dtype not in kinds:
             raise InputError(
                 f"{name}: weights of another model: {key} has shape {list(tensor.shape)} of {tensor.dtype}, expected "
                 f"{list(expected[key].shape)} of {expected[key].dtype}"
