@@ -14,6 +14,7 @@ from carstudio.rendering.rays import to_canonical
 from carstudio.training.batches import generator_for
 from carstudio.training.config import TrainConfig
 from carstudio.training.losses import training_loss
+from carstudio.training.optimizers import build_optimizer
 from carstudio.training.precision import Precision, autocast
 
 
@@ -32,7 +33,7 @@ class Subject:
         self.name, self.device, self.config = config.recipe, device, config
         torch.manual_seed(0)
         self.model = build_model(self.config.model).to(device)
-        self.optimizer = torch.optim.RAdam(self.model.parameters(), lr=1e-4)
+        self.optimizer = build_optimizer(self.model, self.config.optimizer, rate=1e-4)
         own = self.config.rays_per_patch
         rays_per_patch = rays_per_patch or (own if own <= 512 else 128)
         batch = random_batch(self.config.patches_per_step, rays_per_patch, self.model.encoder_side_px)

@@ -1,0 +1,76 @@
+"""How much a wrong 3-D box of the encoded photo costs; the box that the scored photo is drawn in is right.
+
+Usage: python -m bench.box_errors STORE MODEL [MODEL ...] [--limit 128]
+"""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import torch
+import tyro
+from rich.progress import track
+
+from carstudio.dataset.pixels import PatchCache
+from carstudio.dataset.store import PatchStore, open_store
+from carstudio.evaluation.metrics import score_image
+from carstudio.evaluation.protocols import EvaluationConfig, ViewPair, view_pairs
+from carstudio.geometry.box3d import Box3D
+from carstudio.geometry.transforms import rotation_y
+from carstudio.models.interface import CategoryModel, render_image
+from carstudio.training.batches import patch_batch, stack_boxes
+from carstudio.training.checkpoint import load_model
+
+# name: (shift along the car's axes as a share of its size, turn in degrees, size as a factor)
+ERRORS: dict[str, tuple[float, float, float]] = {
+    "none": (0.0, 0.0, 1.0),
+    "place 3 %": (0.03, 0.0, 1.0),
+    "place 6 %": (0.06, 0.0, 1.0),
+    "heading 5 deg": (0.0, 5.0, 1.0),
+    "heading 10 deg": (0.0, 10.0, 1.0),
+    "size 5 %": (0.0, 0.0, 1.05),
+    "size 10 %": (0.0, 0.0, 1.10),
+}
+
+
+def wrong_box(box: Box3D, error: tuple[float, float, float], generator: torch.Generator) -> Box3D:
+    """The box with its place off by that share of each of its sizes, turned and scaled; signs are drawn."""
+    share, turn_deg, factor = error
+    signs = torch.randint(0, 2, (5,), generator=generator) * 2.0 - 1
+    center = box.center + box.rotation @ (box.size * share * signs[:3])
+    turn = rotation_y(torch.tensor(math.radians(turn_deg)) * signs[3])
+    return Box3D(center, box.size * (factor if signs[4] > 0 else 1 / factor), box.rotation @ turn)
+
+
+@torch.no_grad()
+def mean_scores(
+    model: CategoryModel, store: PatchStore, pairs: list[ViewPair], error: tuple[float, float, float]
+) -> tuple[float, float, float]:
+    """PSNR, SSIM and mask IoU over the pairs, with the encoded photo's box wrong."""
+    cache, generator = PatchCache(store, model.encoder_side_px), torch.Generator().manual_seed(0)
+    found = []
+    for pair in track(pairs, description=str(error), transient=True):
+        shown, scored = cache[pair.input_patch_id], cache[pair.scored_patch_id]
+        shown = dataclasses.replace(shown, box=wrong_box(shown.box, error, generator))
+        image = render_image(model, scored.camera, model.encode(patch_batch([shown])), stack_boxes([scored.box]))
+        scores = score_image(image["rgb"], image["opacity"], scored.rgb.float() / 255, scored.mask)
+        found.append([scores.psnr, scores.ssim, scores.mask_iou])
+    return tuple(torch.tensor(found).nanmean(dim=0).tolist())  # type: ignore[return-value]
+
+
+def main(store: tyro.conf.Positional[Path], models: tyro.conf.Positional[tuple[str, ...]], limit: int = 128) -> None:
+    """Print a table: one row per error, PSNR / SSIM / mask IoU of each model on novel views."""
+    opened = open_store(store)
+    pairs = view_pairs(opened, EvaluationConfig(protocol="novel-view", split=None, part="all", limit=limit))
+    loaded = {name: load_model(name) for name in models}
+    print("| error | " + " | ".join(loaded) + " |")
+    print("|---" * (len(loaded) + 1) + "|")
+    for name, error in ERRORS.items():
+        cells = [
+            "{:.2f} / {:.3f} / {:.3f}".format(*mean_scores(model, opened, pairs, error)) for model in loaded.values()
+        ]
+        print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)
