@@ -1,8 +1,8 @@
 """Speed and memory of this machine: `./run bench` (or `python -m bench`) prints a Markdown table.
 
-Training: one step (encode, trace, loss, backward, the recipe's optimiser) of a recipe with its own number of patches and rays, or --rays
-rays of each patch (128 for paper-size recipes: the activations of 3 x 1,024 rays may not fit a laptop). Rendering: one
-view of --size px of a car whose photo has been encoded before.
+Training: one step (encode, trace, loss, backward, the recipe's optimiser) of a recipe with its own number of patches
+and rays, or --rays rays of each patch (128 for paper-size recipes: the activations of 3 x 1,024 rays may not fit a
+laptop). Rendering: one view of --size px of a car whose photo has been encoded before.
 Rounds of the recipes are interleaved and medians are given, because shared machines drift; the ratio is to the first
 recipe within the same round. Memory: `bench.memory`, each recipe in processes of its own.
 """

@@ -15,8 +15,7 @@ from carstudio.dataset.pixels import PatchCache
 from carstudio.dataset.store import PatchStore, open_store
 from carstudio.evaluation.metrics import score_image
 from carstudio.evaluation.protocols import EvaluationConfig, ViewPair, view_pairs
-from carstudio.geometry.box3d import Box3D
-from carstudio.geometry.transforms import rotation_y
+from carstudio.geometry.box3d import Box3D, moved_box
 from carstudio.models.interface import CategoryModel, render_image
 from carstudio.training.batches import patch_batch, stack_boxes
 from carstudio.training.checkpoint import load_model
@@ -37,9 +36,8 @@ def wrong_box(box: Box3D, error: tuple[float, float, float], generator: torch.Ge
     """The box with its place off by that share of each of its sizes, turned and scaled; signs are drawn."""
     share, turn_deg, factor = error
     signs = torch.randint(0, 2, (5,), generator=generator) * 2.0 - 1
-    center = box.center + box.rotation @ (box.size * share * signs[:3])
-    turn = rotation_y(torch.tensor(math.radians(turn_deg)) * signs[3])
-    return Box3D(center, box.size * (factor if signs[4] > 0 else 1 / factor), box.rotation @ turn)
+    turn = torch.tensor(math.radians(turn_deg)) * signs[3]
+    return moved_box(box, share * signs[:3], turn, torch.full((3,), factor if signs[4] > 0 else 1 / factor))
 
 
 @torch.no_grad()

@@ -74,6 +74,7 @@ def car_gaussians() -> TrainConfig:
         template_rate=20.0,
         supervision="mixed",
         mirroring="together",
+        box_noise=1.0,
         patches_per_step=32,
         rays_per_patch=256,
         precision="auto",

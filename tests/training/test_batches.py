@@ -5,7 +5,17 @@ import torch
 
 from carstudio.dataset.pixels import PatchCache, mirror_patch, prepare_patch
 from carstudio.dataset.store import PatchStore
-from carstudio.training.batches import StepSampler, generator_for, pixel_batch
+from carstudio.geometry.box3d import Box3D
+from carstudio.geometry.transforms import rotation_y
+from carstudio.training.batches import (
+    HEADING_NOISE_DEG,
+    PLACE_NOISE,
+    SIZE_NOISE,
+    StepSampler,
+    generator_for,
+    noisy_box,
+    pixel_batch,
+)
 from training.toy import SIDE_PX, toy_store
 
 
@@ -56,9 +66,9 @@ def test_streams_and_steps_do_not_share_numbers() -> None:
         tuple(torch.rand(4, generator=generator_for(seed, step, stream)).tolist())
         for seed in range(3)
         for step in range(20)
-        for stream in ("epoch", "target", "pixels", "jitter", "mirror")
+        for stream in ("epoch", "target", "pixels", "jitter", "mirror", "box")
     }
-    assert len(draws) == 3 * 20 * 5
+    assert len(draws) == 3 * 20 * 6
 
 
 def test_pixels_carry_the_colour_that_stands_there(store: PatchStore) -> None:
@@ -124,3 +134,34 @@ def test_mirroring_flips_half_of_the_photos_together_or_apart(store: PatchStore)
     assert set(drawn["together"]) == {(False, False), (True, True)}
     assert set(drawn["apart"]) == {(a, b) for a in (False, True) for b in (False, True)}
     assert 160 <= sum(pair[0] for pair in drawn["together"]) <= 240  # half of 400, four standard deviations
+
+
+def test_rough_boxes_are_those_of_encoded_photos_alone(store: PatchStore) -> None:
+    """Same photos, pixels and rays; each photo's box is its own and the same whoever asks."""
+    cache = PatchCache(store, 32)
+    plain, rough, again = (
+        StepSampler(cache, store.patch_ids(), patches_per_step=5, supervision="single-view", seed=0, box_noise=noise)
+        for noise in (0.0, 1.0, 1.0)
+    )
+    (shown, explained), (moved, same) = plain.batch(3, 16), rough.batch(3, 16)
+    assert torch.equal(shown.image, moved.image)
+    assert torch.equal(explained.rgb, same.rgb)
+    assert torch.equal(explained.box.center, same.box.center)
+    assert not torch.equal(shown.box.center, moved.box.center)
+    assert torch.equal(again.batch(3, 16, range(2, 4))[0].box.center, moved.box.center[2:4])
+
+
+def test_how_rough_they_are() -> None:
+    """Of 4,000 boxes: the scale is uniform in [0, 2], so a variance is 4/3 of the stated one; all stay rotations."""
+    box = Box3D(torch.tensor([1.0, 0.5, 12.0]), torch.tensor([4.0, 1.5, 1.8]), rotation_y(torch.tensor(0.7)))
+    generator = torch.Generator().manual_seed(0)
+    boxes = [noisy_box(box, 1.0, generator) for _ in range(4000)]
+    shift = torch.stack([(b.center - box.center) @ box.rotation / box.size for b in boxes])
+    turn = torch.stack([torch.rad2deg(b.yaw_rad - box.yaw_rad) for b in boxes])
+    growth = torch.stack([(b.size / box.size).log() for b in boxes])
+    for values, deviation in ((shift, PLACE_NOISE), (turn, HEADING_NOISE_DEG), (growth, SIZE_NOISE)):
+        assert values.mean(dim=0).abs().max() < 0.08 * deviation
+        assert torch.allclose(values.std(dim=0), torch.tensor(deviation * (4 / 3) ** 0.5), rtol=0.06)
+    turned = torch.stack([b.rotation for b in boxes])
+    assert torch.allclose(turned @ turned.mT, torch.eye(3).expand(4000, 3, 3), atol=1e-5)
+    assert torch.equal(noisy_box(box, 0.0, generator).size, box.size)

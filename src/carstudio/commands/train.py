@@ -57,6 +57,8 @@ class Train(Output):
     less for a short run from --init, which would otherwise forget what it started from)."""
     supervision: Supervision | None = None
     """Which photo an encoded photo must explain (the recipe's own when absent)."""
+    box_noise: float | None = None
+    """How rough the boxes of encoded photos are made in training; 0: not at all (the recipe's own when absent)."""
     optimizer: OptimizerName | None = None
     """radam (the paper's), adamw, or adam in one fused kernel (the recipe's own when absent)."""
     pictures: Annotated[int, tyro.conf.arg(metavar="N")] = 6
@@ -72,6 +74,10 @@ class Train(Output):
             config = replace(config, steps=self.steps)
         if self.supervision is not None:
             config = replace(config, supervision=self.supervision)
+        if self.box_noise is not None:
+            if self.box_noise < 0:
+                raise InputError(f"--box-noise must be 0 or more, found {self.box_noise}")
+            config = replace(config, box_noise=self.box_noise)
         if self.learning_rate is not None:
             if not self.learning_rate > 0:
                 raise InputError(f"--learning-rate must be positive, found {self.learning_rate}")

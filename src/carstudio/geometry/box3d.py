@@ -80,6 +80,17 @@ def mirror_box(box: Box3D) -> Box3D:
     return Box3D(box.center * mirror_x, box.size, mirror_x[:, None] * box.rotation * mirror_z)
 
 
+def moved_box(
+    box: Box3D,
+    shift: Float[Tensor, "*batch 3"],
+    turn_rad: Float[Tensor, "*batch"],
+    growth: Float[Tensor, "*batch 3"],
+) -> Box3D:
+    """The box moved along its axes by shares of its sizes, turned about its vertical axis, its sizes multiplied."""
+    center = box.center + (box.rotation @ (shift * box.size)[..., None]).squeeze(-1)
+    return Box3D(center, box.size * growth, box.rotation @ rotation_y(turn_rad))
+
+
 def projected_hull_points(box: Box3D, camera: Camera, near_m: float = 0.1) -> Float[Tensor, "n 2"]:
     """Image positions whose convex hull is the box's outline: its corners, the edges cut at the near plane.
 

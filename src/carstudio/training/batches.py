@@ -4,9 +4,10 @@ The sampler has no state: the patches of step k are found from the seed alone, s
 """
 
 import hashlib
+import math
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -17,14 +18,16 @@ from carstudio.dataset.patch import MaskValue
 from carstudio.dataset.pixels import PatchCache, PreparedPatch, mirror_patch
 from carstudio.dataset.store import PatchStore
 from carstudio.errors import InputError
-from carstudio.geometry.box3d import Box3D
+from carstudio.geometry.box3d import Box3D, moved_box
 from carstudio.geometry.camera import Camera
 from carstudio.models.interface import PatchBatch
 from carstudio.rendering.rays import Rays, pixel_rays
 
 Supervision = Literal["single-view", "multi-view", "mixed"]
 Mirroring = Literal["off", "together", "apart"]
-_STREAMS = {"epoch": 1, "target": 2, "pixels": 3, "jitter": 4, "mirror": 5}
+# Standard deviations of labelled boxes' errors: place (share of the size), heading (degrees), size (share)
+PLACE_NOISE, HEADING_NOISE_DEG, SIZE_NOISE = 0.03, 3.0, 0.03
+_STREAMS = {"epoch": 1, "target": 2, "pixels": 3, "jitter": 4, "mirror": 5, "box": 6}
 
 
 def generator_for(seed: int, step: int, stream: str, row: int = 0) -> torch.Generator:
@@ -89,6 +92,17 @@ def patch_batch(patches: list[PreparedPatch]) -> PatchBatch:
     )
 
 
+def noisy_box(box: Box3D, amount: float, generator: torch.Generator) -> Box3D:
+    """A box as rough as labels and detectors give it: errors are normal, of 0 to 2 `amount` usual standard deviations.
+
+    How rough a box is differs from box to box, so a model meets exact ones too.
+    """
+    scale = 2 * amount * torch.rand(1, generator=generator)
+    draws = torch.randn(7, generator=generator) * scale
+    turn = math.radians(HEADING_NOISE_DEG) * draws[3]
+    return moved_box(box, PLACE_NOISE * draws[:3], turn, torch.exp(SIZE_NOISE * draws[4:]))
+
+
 def stack_boxes(boxes: list[Box3D]) -> Box3D:
     """A batch of boxes from single ones."""
     return Box3D(
@@ -132,6 +146,7 @@ class StepSampler:
 
     Mirroring shows photos flipped left to right half of the time (a car is symmetric): encoded and explained patch
     `together`, or each by its own draw, so that a flipped photo `apart` from the encoded one is a second view of it.
+    `box_noise` makes the boxes of encoded patches rough (`noisy_box`); those that are explained stay as they are.
     """
 
     def __init__(
@@ -143,9 +158,10 @@ class StepSampler:
         supervision: Supervision,
         seed: int,
         mirroring: Mirroring = "off",
+        box_noise: float = 0.0,
     ) -> None:
         assert patch_ids, "no patches to train on"
-        self.mirroring = mirroring
+        self.mirroring, self.box_noise = mirroring, box_noise
         self.cache, self.patch_ids, self.seed = cache, patch_ids, seed
         self.patches_per_step, self.supervision = patches_per_step, supervision
         table = cache.store.table(["patch_id", "instance_id"])
@@ -197,6 +213,11 @@ class StepSampler:
         targets = self.target_ids(step, inputs)
         flips = self.mirrored(step)
         shown = [self._patch(inputs[row], flips[row][0]) for row in rows]
+        if self.box_noise:
+            shown = [
+                replace(patch, box=noisy_box(patch.box, self.box_noise, generator_for(self.seed, step, "box", row)))
+                for row, patch in zip(rows, shown, strict=True)
+            ]
         explained = [self._patch(targets[row], flips[row][1]) for row in rows]
         generators = [generator_for(self.seed, step, "pixels", row) for row in rows]
         return patch_batch(shown), pixel_batch(explained, rays_per_patch, generators)

@@ -27,6 +27,8 @@ class TrainConfig:
     """Which photo of the car an encoded photo must explain."""
     mirroring: Mirroring = "off"
     """Whether photos are flipped left to right half of the time: never, input and explained photo alike, or each."""
+    box_noise: float = 0.0
+    """How rough the boxes of encoded photos are made: 1: as labels and detectors are, 0: as they stand in the store."""
     patches_per_step: int = 3
     """Cars encoded per step."""
     rays_per_patch: int = 1024

@@ -183,6 +183,7 @@ class _Run:
             supervision=config.supervision,
             seed=config.seed,
             mirroring=config.mirroring,
+            box_noise=config.box_noise,
         )
 
     def begin(self, *, init: Path | None) -> None:
