@@ -39,11 +39,12 @@ SHIFT_M = 1.4  # to the side: where each car is drawn
 def made_up_scene(folder: Path, frames: int) -> Scene:
     """A log of noise with five cars, each driving 0.5 m per frame."""
     shelf, random = CarShelf(folder / "scene"), torch.Generator().manual_seed(0)
-    sha256 = describe_model(bundled_models()["car-gaussians"]).sha256
+    described = describe_model(bundled_models()["car-gaussians"])
+    sha256, code_size = described.sha256, described.config.code_size  # type: ignore[union-attr]
     size, turn = (4.2, 1.5, 1.8), quaternion_from_rotation(rotation_y(torch.tensor(-1.5, dtype=torch.float64)))
     tracks = {}
     for i, (x, z) in enumerate(PLACES):
-        codes = Latents(torch.randn(1, 128, generator=random), torch.randn(1, 128, generator=random))
+        codes = Latents(*torch.randn(2, 1, code_size, generator=random))
         car = Car(codes, size, "car-gaussians", sha256, f"car-{i}", "CC0-1.0", provenance={"scene_key": "bench"})
         boxes = {k: PlacedBox((x, 0.9, z + 0.5 * k), size, tuple(turn.tolist())) for k in range(frames)}
         tracks[str(i)] = Track(track_id=str(i), boxes=boxes, car=shelf.add(car, f"car-{i}"))

@@ -12,9 +12,9 @@ from carstudio.fitting.boxes import BoxFreedom, BoxMoves, across, moved_boxes, p
 from carstudio.fitting.optimise import FitConfig, FitPixels, fit
 from carstudio.geometry.box3d import Box3D, box_from_kitti
 from carstudio.geometry.camera import Camera
-from carstudio.models.interface import Latents
 from carstudio.rendering.rays import image_rays
 from carstudio.rendering.volume import Rendering
+from models.codes import mean_latents
 
 CAMERA = Camera(torch.tensor([700.0, 700.0, 600.0, 180.0]), 1242, 375)
 ALL = BoxFreedom(refine_pose=True, refine_size=True)
@@ -113,7 +113,7 @@ def test_lines_of_sight_turn_the_shortest_way() -> None:
 def test_a_wrong_pose_is_found_again() -> None:
     """A car drawn at its true box, told a wrong one: shift, turn and apparent size come back from the pixels."""
     model = carstudio.load_model("car-gaussians")
-    latents = Latents(torch.zeros(1, 128), torch.zeros(1, 128))
+    latents = mean_latents(model)
     true = box_from_kitti(torch.tensor([[0.6, 1.3, 8.0]]), torch.tensor([[4.2, 1.5, 1.8]]), torch.tensor([0.7]))
     one = torch.zeros(1, dtype=torch.long)
     wrong_by = BoxMoves(torch.tensor([[0.5, -0.4, 0.1, 0.6, -0.1, 0.5]]), torch.zeros(1, 3))

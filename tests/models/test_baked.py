@@ -15,6 +15,7 @@ from carstudio.geometry.camera import Camera
 from carstudio.geometry.orbit import orbit_box, orbit_camera
 from carstudio.models.interface import CategoryModel, Latents, render_image, window_of
 from carstudio.report.panels import encode_patch
+from models.codes import mean_latents
 from training.toy import toy_store
 
 LEAST_DB = 34.0
@@ -117,11 +118,11 @@ def test_a_car_out_of_sight_gives_an_empty_picture(center: list[float]) -> None:
 
 
 def test_what_has_no_gaussians_is_refused() -> None:
-    latents = Latents(torch.zeros(1, 128), torch.zeros(1, 128))
+    latents = mean_latents(bundled("car-nerf-small"))
     with pytest.raises(InputError, match="car-gaussians"):
         carstudio.bake(bundled("car-nerf-small"), latents)
     with pytest.raises(InputError, match="one car at a time"):
-        carstudio.bake(bundled("car-gaussians"), Latents(torch.zeros(2, 128), torch.zeros(2, 128)))
+        carstudio.bake(bundled("car-gaussians"), mean_latents(bundled("car-gaussians"), cars=2))
 
 
 def test_damaged_weights_are_named() -> None:

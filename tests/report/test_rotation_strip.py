@@ -14,13 +14,14 @@ from carstudio.dataset.sources.synthetic import SynthConfig, synthesize
 from carstudio.dataset.store import open_store
 from carstudio.geometry.box3d import box_from_kitti
 from carstudio.geometry.camera import Camera
-from carstudio.models.interface import Latents, render_image
+from carstudio.models.interface import render_image
 from carstudio.report.rotation_strip import rotation_strip, seen_by, strip_camera, true_views, turns
+from models.codes import mean_latents
 
 
 def test_a_strip_is_the_car_at_other_yaws() -> None:
     model = carstudio.load_model("car-gaussians")
-    latents = Latents(torch.zeros(1, 128), torch.zeros(1, 128))
+    latents = mean_latents(model)
     camera = Camera(torch.tensor([90.0, 90.0, 32.0, 24.0]), 64, 48)
 
     def box(yaw: float):

@@ -7,12 +7,12 @@ import numpy as np
 import torch
 
 from carstudio.fitting.car_file import Car
-from carstudio.models.interface import Latents
 from carstudio.scene.graph import FileRef, PlacedBox, Scene, SceneFrame, Track
 from carstudio.scene.places import box_standing, turn_y
 from carstudio.scene.poses import to_matrix
 from carstudio.scene.shelf import CarShelf
 from carstudio.training.checkpoint import describe_model
+from models.codes import drawn_latents
 
 FRAMES = 12
 SIZE = (4.0, 1.5, 1.8)
@@ -65,9 +65,8 @@ def made_up_scene(*, has_poses: bool = True) -> Scene:
 def made_up_car(seed: int, size: tuple[float, float, float] = SIZE) -> Car:
     """A car of the bundled model whose codes are drawn by chance."""
     generator = torch.Generator().manual_seed(seed)
-    shape, texture = torch.randn(2, 1, 128, generator=generator)
     return Car(
-        latents=Latents(shape, texture),
+        latents=drawn_latents(describe_model("car-gaussians").config, generator),
         size=size,
         model_name="car-gaussians",
         model_sha256=describe_model("car-gaussians").sha256,

@@ -19,6 +19,7 @@ from carstudio.scene.graph import CarRef, FileRef, PlacedBox, Scene, SceneFrame,
 from carstudio.scene.shelf import CarShelf
 from carstudio.training.bundled import bundled_models
 from carstudio.training.checkpoint import describe_model
+from models.codes import drawn_latents
 
 WIDTH, HEIGHT, HEIGHT_M = 160, 96, 1.65
 INTRINSICS = (120.0, 120.0, 80.0, 40.0)
@@ -62,7 +63,7 @@ def photograph(index: int, blocks: tuple[PlacedBox, ...] = ()) -> np.ndarray:
 def latents(seed: int) -> Latents:
     """Codes as the model's LayerNorm gives them."""
     random = torch.Generator().manual_seed(seed)
-    return Latents(torch.randn(1, 128, generator=random), torch.randn(1, 128, generator=random))
+    return drawn_latents(describe_model("car-gaussians").config, random)
 
 
 def shelve(folder: Path, name: str, seed: int) -> CarRef:
