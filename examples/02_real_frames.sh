@@ -17,7 +17,7 @@ case $segmenter in onnx:*) "$run" setup onnx ;; esac
 "$run" carstudio build kitti-mot --root "$root" --sequence "$sequence" --frames "$frames" --segmenter "$segmenter" \
     --out "$out/cars"
 "$run" carstudio report "$model" --data "$out/cars" --split view --out "$out/zero-shot-report"
-case $model in car-gaussians*) gentle=3e-5 ;; *) gentle=5e-4 ;; esac
+case $model in car-gaussians*) gentle=2e-4 ;; *) gentle=5e-4 ;; esac
 for start in scratch pretrained; do
     options="--minutes 3"
     # Gently: at the recipe's own learning rate a few views make the model forget what cars look like.

@@ -53,8 +53,8 @@ class Train(Output):
     split: str | None = "instance"
     """Split whose training part is used; "None" for all kept patches."""
     learning_rate: float | None = None
-    """First learning rate; the last one keeps its ratio to it (the recipe's own when absent; a tenth of it or
-    less for a short run from --init, which would otherwise forget what it started from)."""
+    """First learning rate; the last one keeps its ratio to it (the recipe's own when absent; less for a
+    short run from --init: for fields a tenth, or they forget what they started from)."""
     supervision: Supervision | None = None
     """Which photo an encoded photo must explain (the recipe's own when absent)."""
     box_noise: float | None = None
