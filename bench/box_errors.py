@@ -6,18 +6,16 @@ Usage: python -m bench.box_errors STORE MODEL [MODEL ...] [--limit 128]
 import dataclasses
 import math
 from pathlib import Path
+from statistics import fmean
 
 import torch
 import tyro
-from rich.progress import track
 
-from carstudio.dataset.pixels import PatchCache
+from carstudio.dataset.pixels import PreparedPatch
 from carstudio.dataset.store import PatchStore, open_store
-from carstudio.evaluation.metrics import score_image
-from carstudio.evaluation.protocols import EvaluationConfig, ViewPair, view_pairs
-from carstudio.geometry.box3d import Box3D, moved_box
-from carstudio.models.interface import CategoryModel, render_image
-from carstudio.training.batches import patch_batch, stack_boxes
+from carstudio.evaluation.protocols import EvaluationConfig, ViewPair, score_views, view_pairs
+from carstudio.geometry.box3d import Box3D, displaced_box
+from carstudio.models.interface import CategoryModel
 from carstudio.training.checkpoint import load_model
 
 # name: (shift along the car's axes as a share of its size, turn in degrees, size as a factor)
@@ -37,23 +35,21 @@ def wrong_box(box: Box3D, error: tuple[float, float, float], generator: torch.Ge
     share, turn_deg, factor = error
     signs = torch.randint(0, 2, (5,), generator=generator) * 2.0 - 1
     turn = torch.tensor(math.radians(turn_deg)) * signs[3]
-    return moved_box(box, share * signs[:3], turn, torch.full((3,), factor if signs[4] > 0 else 1 / factor))
+    return displaced_box(box, share * signs[:3], turn, torch.full((3,), factor if signs[4] > 0 else 1 / factor))
 
 
-@torch.no_grad()
-def mean_scores(
+def scores_with(
     model: CategoryModel, store: PatchStore, pairs: list[ViewPair], error: tuple[float, float, float]
-) -> tuple[float, float, float]:
-    """PSNR, SSIM and mask IoU over the pairs, with the encoded photo's box wrong."""
-    cache, generator = PatchCache(store, model.encoder_side_px), torch.Generator().manual_seed(0)
-    found = []
-    for pair in track(pairs, description=str(error), transient=True):
-        shown, scored = cache[pair.input_patch_id], cache[pair.scored_patch_id]
-        shown = dataclasses.replace(shown, box=wrong_box(shown.box, error, generator))
-        image = render_image(model, scored.camera, model.encode(patch_batch([shown])), stack_boxes([scored.box]))
-        scores = score_image(image["rgb"], image["opacity"], scored.rgb.float() / 255, scored.mask)
-        found.append([scores.psnr, scores.ssim, scores.mask_iou])
-    return tuple(torch.tensor(found).nanmean(dim=0).tolist())  # type: ignore[return-value]
+) -> str:
+    """PSNR / SSIM / mask IoU over the pairs, with the encoded photo's box wrong."""
+    generator = torch.Generator().manual_seed(0)
+
+    def alter(shown: PreparedPatch) -> PreparedPatch:
+        return dataclasses.replace(shown, box=wrong_box(shown.box, error, generator))
+
+    scores = [view.scores for view in score_views(model, store, pairs, alter=alter)]
+    psnr, ssim, iou = (fmean(getattr(one, name) for one in scores) for name in ("psnr", "ssim", "mask_iou"))
+    return f"{psnr:.2f} / {ssim:.3f} / {iou:.3f}"
 
 
 def main(store: tyro.conf.Positional[Path], models: tyro.conf.Positional[tuple[str, ...]], limit: int = 128) -> None:
@@ -64,9 +60,7 @@ def main(store: tyro.conf.Positional[Path], models: tyro.conf.Positional[tuple[s
     print("| error | " + " | ".join(loaded) + " |")
     print("|---" * (len(loaded) + 1) + "|")
     for name, error in ERRORS.items():
-        cells = [
-            "{:.2f} / {:.3f} / {:.3f}".format(*mean_scores(model, opened, pairs, error)) for model in loaded.values()
-        ]
+        cells = [scores_with(model, opened, pairs, error) for model in loaded.values()]
         print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
 
 

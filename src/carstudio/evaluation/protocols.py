@@ -5,7 +5,7 @@ another view of the same car. Scores are per image, on the box crop at its own r
 """
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -124,13 +124,15 @@ def score_views(
     lpips: Lpips | None = None,
     report: Report = silent,
     description: str = "scoring",
+    alter: Callable[[PreparedPatch], PreparedPatch] | None = None,
 ) -> Iterator[ScoredView]:
-    """Encode, render at the crop's resolution and score each pair."""
+    """Encode, render at the crop's resolution and score each pair; `alter` changes what is encoded, to see the harm."""
     device = next(model.parameters()).device
     cache = PatchCache(store, model.encoder_side_px)
     model.eval()
     for done, pair in enumerate(pairs, start=1):
         shown, scored = cache[pair.input_patch_id], cache[pair.scored_patch_id]
+        shown = alter(shown) if alter else shown
         latents = model.encode(patch_batch([shown]).to(device))
         image = render_image(model, scored.camera.to(device), latents, stack_boxes([scored.box]).to(device))
         rgb, opacity, depth = (image[name].cpu() for name in ("rgb", "opacity", "depth_m"))

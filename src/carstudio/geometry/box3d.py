@@ -80,7 +80,7 @@ def mirror_box(box: Box3D) -> Box3D:
     return Box3D(box.center * mirror_x, box.size, mirror_x[:, None] * box.rotation * mirror_z)
 
 
-def moved_box(
+def displaced_box(
     box: Box3D,
     shift: Float[Tensor, "*batch 3"],
     turn_rad: Float[Tensor, "*batch"],

@@ -18,7 +18,7 @@ from carstudio.dataset.patch import MaskValue
 from carstudio.dataset.pixels import PatchCache, PreparedPatch, mirror_patch
 from carstudio.dataset.store import PatchStore
 from carstudio.errors import InputError
-from carstudio.geometry.box3d import Box3D, moved_box
+from carstudio.geometry.box3d import Box3D, displaced_box
 from carstudio.geometry.camera import Camera
 from carstudio.models.interface import PatchBatch
 from carstudio.rendering.rays import Rays, pixel_rays
@@ -100,7 +100,7 @@ def noisy_box(box: Box3D, amount: float, generator: torch.Generator) -> Box3D:
     scale = 2 * amount * torch.rand(1, generator=generator)
     draws = torch.randn(7, generator=generator) * scale
     turn = math.radians(HEADING_NOISE_DEG) * draws[3]
-    return moved_box(box, PLACE_NOISE * draws[:3], turn, torch.exp(SIZE_NOISE * draws[4:]))
+    return displaced_box(box, PLACE_NOISE * draws[:3], turn, torch.exp(SIZE_NOISE * draws[4:]))
 
 
 def stack_boxes(boxes: list[Box3D]) -> Box3D:
