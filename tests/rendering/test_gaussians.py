@@ -11,8 +11,9 @@ from carstudio.geometry.camera import Camera
 from carstudio.geometry.canonical import canonical_from_camera
 from carstudio.geometry.transforms import rotation_from_quaternion
 from carstudio.rendering.gaussians import hits
-from carstudio.rendering.gaussians.cloud import GaussianCloud, Splats, invert_symmetric, splats_of, widened_splats
+from carstudio.rendering.gaussians.cloud import GaussianCloud, Splats, splats_of, widened_splats
 from carstudio.rendering.gaussians.reference import MAX_ALPHA, responses, sorted_responses
+from carstudio.rendering.gaussians.symmetric import Symmetric3, planes3
 from carstudio.rendering.gaussians.tracing import SplattingConfig, render_cloud, trace_cloud
 from carstudio.rendering.rays import Rays, image_rays, to_canonical
 from carstudio.rendering.volume import Rendering, composite, merge_segments
@@ -37,7 +38,7 @@ def test_peaks_are_the_maxima_along_the_ray() -> None:
     alpha, t = responses(splats_of(cloud), points, rays.view_directions)
     at = torch.linspace(-4, 4, 8001, dtype=torch.float64)
     x = points[0, :, None, None] + at[:, None] * rays.view_directions[0, :, None, None] - cloud.mean[0, None, :, None]
-    inverse = torch.linalg.inv(cloud.covariance()[0])
+    inverse = torch.linalg.inv(cloud.covariance().matrix()[0])
     exponent = torch.einsum("rnti,nij,rntj->rnt", x, inverse, x)
     found, place = (cloud.opacity[0, :, None] * torch.exp(-exponent / 2)).max(dim=-1)
     assert torch.allclose(alpha[0], found.clamp(max=MAX_ALPHA), atol=1e-3)  # 0.001 apart: a slope of 1 / (2 * 0.03)
@@ -52,10 +53,21 @@ def _rays(view: Camera, box: Box3D, count: int) -> Rays:
 
 
 def test_cofactors_invert() -> None:
-    matrix = random_cloud(30).covariance()
-    inverse, determinant = invert_symmetric(matrix)
-    assert torch.allclose(inverse, torch.linalg.inv(matrix), rtol=1e-9)
-    assert torch.allclose(determinant, torch.linalg.det(matrix), rtol=1e-9)
+    matrix = random_cloud(30).covariance().matrix()
+    found = Symmetric3.of_matrix(matrix)
+    assert torch.equal(found.matrix(), matrix)
+    assert torch.allclose(found.inverse().matrix(), torch.linalg.inv(matrix), rtol=1e-9)
+    determinant = torch.linalg.det(matrix)[..., None, None]
+    assert torch.allclose(found.cofactors().matrix(), determinant * torch.linalg.inv(matrix), rtol=1e-9)
+    vector = torch.randn(*matrix.shape[:-1], dtype=matrix.dtype, generator=torch.Generator().manual_seed(0))
+    along = torch.einsum("bni,bnij,bnj->bn", vector, matrix, vector)
+    assert torch.allclose(found.quadratic(planes3(vector)), along, rtol=1e-9)
+
+
+def test_covariances_are_those_of_rotated_axes() -> None:
+    cloud = random_cloud(30)
+    axes = rotation_from_quaternion(cloud.quaternion) * torch.exp(cloud.log_scale)[..., None, :]
+    assert torch.allclose(cloud.covariance().matrix(), axes @ axes.mT, rtol=1e-9, atol=1e-15)
 
 
 def test_the_plain_path_has_the_gradients_of_its_values() -> None:
@@ -171,7 +183,8 @@ def test_a_metric_scene_looks_like_its_canonical_one() -> None:
     inverse = torch.linalg.inv(canonical_from_camera(box)[0])
     linear = inverse[:3, :3]
     mean = cloud.mean @ linear.mT + inverse[:3, 3]
-    metric = Splats(mean, torch.linalg.inv(linear @ cloud.covariance() @ linear.mT), cloud.opacity)
+    precision = torch.linalg.inv(linear @ cloud.covariance().matrix() @ linear.mT)
+    metric = Splats(mean, Symmetric3.of_matrix(precision), cloud.opacity)
     alpha, distance, _ = sorted_responses(metric, rays.origins, rays.directions, torch.zeros_like(rays.radii))
     found = trace_cloud(cloud, rays, canonical, replace(REFERENCE, widen=False))
     assert torch.allclose(found.alpha, alpha, atol=1e-9)
@@ -253,7 +266,7 @@ def test_a_mirrored_scene_gives_the_flipped_picture(config: SplattingConfig) -> 
 def test_mirroring_negates_z_of_the_covariance() -> None:
     cloud = random_cloud(20)
     n = torch.diag(torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64))
-    assert torch.allclose(cloud.mirrored().covariance(), n @ cloud.covariance() @ n, atol=1e-12)
+    assert torch.allclose(cloud.mirrored().covariance().matrix(), n @ cloud.covariance().matrix() @ n, atol=1e-12)
     assert torch.allclose(
         torch.linalg.det(rotation_from_quaternion(cloud.mirrored().quaternion)), torch.ones(20).double()
     )
@@ -278,7 +291,7 @@ def test_a_needle_seen_from_afar_keeps_its_share_of_the_light() -> None:
     wide = widened_splats(cloud, eye, torch.full((1, 1, 3), 0.04, dtype=torch.float64))
     # round Gaussians: the area across grows with the variance, 0.0004 to 0.0404
     assert float(wide.opacity) == pytest.approx(0.999 * 0.0004 / 0.0404, rel=1e-9)
-    assert torch.allclose(wide.precision[0, 0], torch.eye(3, dtype=torch.float64) / 0.0404)
+    assert torch.allclose(wide.precision.matrix()[0, 0], torch.eye(3, dtype=torch.float64) / 0.0404)
 
 
 def test_a_tint_changes_colour_with_the_line_of_sight_only() -> None:

@@ -51,7 +51,7 @@ def metric_splats(cloud: GaussianCloud, size: Float[Tensor, "3"]) -> MetricSplat
     The box is scaled differently along its axes, so scales and rotations come from an eigenvalue decomposition.
     """
     linear, shift = gltf_from_canonical(size.double())
-    covariance = linear @ cloud.covariance()[0].double() @ linear.T
+    covariance = linear @ cloud.covariance().matrix()[0].double() @ linear.T
     variance, axes = torch.linalg.eigh(covariance)
     axes = axes * torch.linalg.det(axes)[:, None, None].sign()  # a rotation, not a mirror
     return MetricSplats(

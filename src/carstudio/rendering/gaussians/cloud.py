@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from carstudio.geometry.transforms import rotation_from_quaternion
+from carstudio.rendering.gaussians.symmetric import Planes, Symmetric3, dot, planes, planes3
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,17 @@ class GaussianCloud:
         sight = torch.nn.functional.normalize(self.mean.detach() - eye[:, None], dim=-1)
         return (self.rgb + (self.tint @ sight[..., None]).squeeze(-1)).clamp(0, 1)
 
-    def covariance(self) -> Float[Tensor, "batch splat 3 3"]:
+    def covariance(self) -> Symmetric3:
         """R diag(s^2) R^T."""
-        axes = rotation_from_quaternion(self.quaternion) * torch.exp(self.log_scale)[..., None, :]
-        return axes @ axes.mT
+        w, x, y, z = planes(torch.nn.functional.normalize(self.quaternion, dim=-1))
+        a, b, c = planes3(torch.exp(self.log_scale))
+        xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+        wx, wy, wz = w * x, w * y, w * z
+        first: Planes = ((1 - 2 * (yy + zz)) * a, 2 * (xy - wz) * b, 2 * (xz + wy) * c)  # rows of R diag(s)
+        second: Planes = (2 * (xy + wz) * a, (1 - 2 * (xx + zz)) * b, 2 * (yz - wx) * c)
+        third: Planes = (2 * (xz - wy) * a, 2 * (yz + wx) * b, (1 - 2 * (xx + yy)) * c)
+        rows = ((first, first), (first, second), (first, third), (second, second), (second, third), (third, third))
+        return Symmetric3(*(dot(row, column) for row, column in rows))
 
     def mirrored(self) -> "GaussianCloud":
         """The cloud on the car's other side (z negated): N R N with N = diag(1, 1, -1) turns (w, x, y, z)."""
@@ -50,17 +57,19 @@ class GaussianCloud:
 
 @dataclass(frozen=True)
 class Splats:
-    """Gaussians as rays meet them: mean, precision and opacity after the pixel's footprint has widened them."""
+    """Gaussians as rays meet them: mean, precision and opacity after the pixel's footprint has widened them.
+
+    `precision` holds arrays of shape (batch, splat).
+    """
 
     mean: Float[Tensor, "batch splat 3"]
-    precision: Float[Tensor, "batch splat 3 3"]
+    precision: Symmetric3
     opacity: Float[Tensor, "batch splat"]
 
 
 def splats_of(cloud: GaussianCloud) -> Splats:
     """Splats of a cloud seen by infinitely thin rays."""
-    precision, _ = invert_symmetric(cloud.covariance())
-    return Splats(cloud.mean, precision, cloud.opacity)
+    return Splats(cloud.mean, cloud.covariance().inverse(), cloud.opacity)
 
 
 def widened_splats(
@@ -69,30 +78,11 @@ def widened_splats(
     """Splats of a cloud seen by pixels whose footprint has the (diagonal) canonical variance `footprint`.
 
     `eye` is the camera centre, canonical. Sigma' = Sigma + footprint, and the opacity shrinks as the Gaussian's area
-    across the line of sight grows, so that what a far pixel gathers stays the same: that area squared is
-    det(Sigma) v^T Sigma^-1 v for a line of sight v.
+    across the line of sight grows, so that what a far pixel gathers stays the same: that area squared is v^T C v for a
+    line of sight v and the cofactors C = det(Sigma) Sigma^-1.
     """
     covariance = cloud.covariance()
-    precision, determinant = invert_symmetric(covariance)
-    wide_precision, wide_determinant = invert_symmetric(covariance + torch.diag_embed(footprint))
-    sight = cloud.mean - eye[:, None]
-    area = determinant * quadratic(precision, sight)
-    wide_area = wide_determinant * quadratic(wide_precision, sight)
-    return Splats(cloud.mean, wide_precision, cloud.opacity * (area / wide_area).clamp(max=1.0).sqrt())
-
-
-def quadratic(matrix: Float[Tensor, "*batch 3 3"], vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-    """v^T M v."""
-    return ((matrix @ vector[..., None]).squeeze(-1) * vector).sum(dim=-1)
-
-
-def invert_symmetric(
-    matrix: Float[Tensor, "*batch 3 3"],
-) -> tuple[Float[Tensor, "*batch 3 3"], Float[Tensor, "*batch"]]:
-    """Inverse and determinant of symmetric, positive definite 3 x 3 matrices, by cofactors (elementwise, so fast)."""
-    a, b, c = matrix[..., 0, 0], matrix[..., 0, 1], matrix[..., 0, 2]
-    d, e, f = matrix[..., 1, 1], matrix[..., 1, 2], matrix[..., 2, 2]
-    ca, cb, cc = d * f - e * e, c * e - b * f, b * e - c * d
-    determinant = a * ca + b * cb + c * cc
-    cofactors = torch.stack([ca, cb, cc, cb, a * f - c * c, b * c - a * e, cc, b * c - a * e, a * d - b * b], dim=-1)
-    return cofactors.unflatten(-1, (3, 3)) / determinant[..., None, None], determinant
+    wide = covariance.plus_diagonal(*planes3(footprint))
+    cofactors, sight = wide.cofactors(), planes3(cloud.mean - eye[:, None])
+    narrowing = covariance.cofactors().quadratic(sight) / cofactors.quadratic(sight)
+    return Splats(cloud.mean, wide.inverse_by(cofactors), cloud.opacity * narrowing.clamp(max=1.0).sqrt())

@@ -51,7 +51,7 @@ class Ellipses:
 
 def bake_cloud(cloud: GaussianCloud) -> BakedCloud:
     """The first car of a batch: on the CPU, in single precision, without gradients."""
-    parts = cloud.mean, cloud.covariance(), cloud.opacity, cloud.rgb, cloud.tint
+    parts = cloud.mean, cloud.covariance().matrix(), cloud.opacity, cloud.rgb, cloud.tint
     arrays = [None if part is None else part[0].detach().float().cpu().numpy() for part in parts]
     return BakedCloud(*arrays)  # type: ignore[arg-type]
 

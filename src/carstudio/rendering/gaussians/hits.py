@@ -14,6 +14,7 @@ from torch import Tensor
 
 from carstudio.rendering.gaussians.cloud import Splats
 from carstudio.rendering.gaussians.reference import FAINTEST, MAX_ALPHA
+from carstudio.rendering.gaussians.symmetric import dot, planes3
 
 _CHUNK = {"cpu": 2**17, "other": 2**26}  # ray-splat pairs at a time: on a CPU some arrays of them fit the L2 cache
 REACH = 4.0  # canonical units: farther from x than this along the ray no Gaussian of a box [-1, 1]^3 can peak
@@ -57,10 +58,9 @@ def reach_limit(opacity: Float[Tensor, "batch splat"]) -> Float[Tensor, "batch s
 
 def splat_coefficients(splats: Splats) -> Float[Tensor, "batch 10 splat"]:
     """The ten numbers of each Gaussian that c, b and e are linear in."""
-    p = splats.precision
-    p_mu = (p @ splats.mean[..., None]).squeeze(-1)
-    upper = (p[..., 0, 0], p[..., 1, 1], p[..., 2, 2], p[..., 0, 1], p[..., 0, 2], p[..., 1, 2])
-    return torch.stack([*upper, *p_mu.unbind(-1), (p_mu * splats.mean).sum(dim=-1)], dim=-2)
+    p, mean = splats.precision, planes3(splats.mean)
+    p_mu = p.times(mean)
+    return torch.stack([p.xx, p.yy, p.zz, p.xy, p.xz, p.yz, *p_mu, dot(p_mu, mean)], dim=-2)
 
 
 def ray_features(
@@ -88,7 +88,6 @@ class _Hits(torch.autograd.Function):
         most = min(most, num_splats)
         alpha, t = (features.new_empty(batch, num_rays, most) for _ in range(2))
         index = torch.empty(batch, num_rays, most, dtype=torch.int64, device=features.device)
-        peak = features.new_empty(batch, num_rays, most)
         limit = reach_limit(opacity)
         for entries, rays in _chunks(features, num_splats):
             keys, over, at = _keys(
@@ -97,34 +96,31 @@ class _Hits(torch.autograd.Function):
             keys = _first(keys, most)
             rows = (keys & (2 ** _bits(num_splats) - 1)).long()
             hit = keys < _missed(num_splats)
-            places = rows.flatten(1)
-            found = torch.gather(over, -1, rows) + torch.gather(limit[entries], -1, places).view_as(rows)
-            response = torch.exp(found.clamp_(min=0).mul_(-0.5)).mul_(hit)
-            peak[entries, rays] = response
-            picked = torch.gather(opacity[entries], -1, places).view_as(rows)
-            alpha[entries, rays] = (response * picked).clamp_(max=MAX_ALPHA)
+            # opacity exp(-distance2 / 2) is FAINTEST exp(-over / 2), since over = distance2 - 2 log(opacity / FAINTEST)
+            faded = torch.gather(over, -1, rows).clamp_(max=0).mul_(-0.5).exp_().mul_(hit)
+            alpha[entries, rays] = faded.mul_(FAINTEST).clamp_(max=MAX_ALPHA)
             t[entries, rays] = torch.gather(at, -1, rows).div_(_scale(num_splats)).masked_fill_(~hit, REACH)
             index[entries, rays] = rows
-        ctx.save_for_backward(coefficients, features, alpha, t, index, peak)
+        ctx.save_for_backward(coefficients, opacity, features, alpha, t, index)
         ctx.mark_non_differentiable(index)
         return alpha, t, index
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        coefficients, features, alpha, t, index, peak = ctx.saved_tensors
+        coefficients, opacity, features, alpha, t, index = ctx.saved_tensors
         grad_alpha, grad_t = gradients[0], gradients[1]
         free = (alpha < MAX_ALPHA) & (alpha > 0)
-        grad_alpha = grad_alpha * free
-        grad_opacity = torch.zeros_like(coefficients[:, 0])
-        grad_opacity.scatter_add_(-1, index.flatten(1), (grad_alpha * peak).flatten(1))
-        to_distance2 = grad_alpha * alpha * -0.5
+        to_log = grad_alpha * free * alpha
+        grad_opacity = torch.zeros_like(opacity)
+        grad_opacity.scatter_add_(-1, index.flatten(1), to_log.flatten(1)).div_(opacity.clamp(min=FAINTEST))
+        to_distance2 = to_log * -0.5
         grad_coefficients = torch.zeros_like(coefficients)
         grad_features = torch.zeros_like(features) if ctx.needs_input_grad[2] else None
         for entries, rays in _chunks(features, coefficients.shape[-1]):
             part, rows, at = features[entries, rays], index[entries, rays], t[entries, rays]
             g = to_distance2[entries, rays]
             # distance2 = c - b^2 / e and t = -b / e: their slopes in c, b and e are (1, 2 t, t^2) and (0, -1/e, -t/e).
-            to_t = torch.where(peak[entries, rays] > 0, grad_t[entries, rays], 0.0)
+            to_t = torch.where(alpha[entries, rays] > 0, grad_t[entries, rays], 0.0)
             inverse_e = _inverse_e(part, coefficients[entries], rows) if bool(to_t.any()) else None
             to_b, to_e = 2 * at * g, at * at * g
             if inverse_e is not None:
@@ -170,8 +166,9 @@ def _keys(features: Tensor, coefficients: Tensor, limit: Tensor, nearest: Tensor
     place = torch.add(t, over.clamp(min=0), alpha=1e12)
     if bool((nearest > -REACH).any()):  # the camera is so near that Gaussians may lie behind it
         place = torch.where(t <= nearest[..., None] * scale, float(last), place)
-    keys = place.clamp_(-last, last - 1).to(torch.int32).mul_(2 ** _bits(num_splats))
-    return keys.add_(torch.arange(num_splats, dtype=torch.int32, device=t.device)), over, t
+    numbers = torch.arange(num_splats, dtype=torch.int32, device=t.device)
+    keys = torch.add(numbers, place.clamp_(-last, last - 1).to(torch.int32), alpha=2 ** _bits(num_splats))
+    return keys, over, t
 
 
 def _bits(num_splats: int) -> int:

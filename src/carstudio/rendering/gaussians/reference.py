@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from carstudio.rendering.gaussians.cloud import Splats, quadratic
+from carstudio.rendering.gaussians.cloud import Splats
 
 FAINTEST = 1.0 / 256  # an alpha below it counts as 0, or every Gaussian would be on every ray
 MAX_ALPHA = 0.999  # of one Gaussian: some light comes through, so that gradients reach what lies behind
@@ -19,11 +19,11 @@ def responses(
 ) -> tuple[Float[Tensor, "batch ray splat"], Float[Tensor, "batch ray splat"]]:
     """Alpha of every Gaussian on every ray x + t d, and the t of its peak."""
     offset = points[:, :, None] - splats.mean[:, None]
-    precision = splats.precision[:, None].expand(*offset.shape, 3)
+    precision = splats.precision.matrix()[:, None].expand(*offset.shape, 3)
     direction = directions[:, :, None].expand_as(offset)
     across = (precision @ direction[..., None]).squeeze(-1)
     b, e = (across * offset).sum(dim=-1), (across * direction).sum(dim=-1)
-    distance2 = quadratic(precision, offset) - b * b / e
+    distance2 = ((precision @ offset[..., None]).squeeze(-1) * offset).sum(dim=-1) - b * b / e
     alpha = splats.opacity[:, None] * torch.exp(-distance2.clamp(min=0) / 2)
     return alpha.clamp(max=MAX_ALPHA), -b / e
 

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from carstudio.rendering.gaussians.cloud import Splats, invert_symmetric
+from carstudio.rendering.gaussians.cloud import Splats
 from carstudio.rendering.gaussians.hits import ray_features, reach_limit, splat_coefficients
 
 TILE_PX = 4
@@ -97,10 +97,8 @@ def tile_radius(
 def _is_met(splats: Splats, middle: Tensor, toward: Tensor, radius: Tensor, batch: int) -> Bool[Tensor, "tile splat"]:
     """Which Gaussians each tile may meet."""
     limit = reach_limit(splats.opacity).clamp(min=1e-3)
-    covariance, _ = invert_symmetric(splats.precision)
     ball = (1 + 1 / _SHARE) * radius**2 / limit
-    eye = torch.eye(3, dtype=covariance.dtype, device=covariance.device)
-    outer, _ = invert_symmetric((1 + _SHARE) * covariance + ball[..., None, None] * eye)
+    outer = (splats.precision.inverse() * (1 + _SHARE)).plus_diagonal(ball, ball, ball).inverse()
     coefficients = splat_coefficients(Splats(splats.mean, outer, splats.opacity))
     features = ray_features(*(rays.view(batch, -1, 3) for rays in (middle, toward)))
     c, b, e = (part @ coefficients[:, : part.shape[-1]] for part in features)
