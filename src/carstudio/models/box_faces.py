@@ -26,35 +26,34 @@ def box_faces(patches: PatchBatch, side_px: int) -> Float[Tensor, "batch 5 side 
     """
     eye = canonical_from_camera(patches.box)[:, :3, 3]
     near_side = torch.where(eye[:, 2] >= 0, 1.0, -1.0).to(eye)
-    points, outward = _planes(side_px, eye)
-    turned = torch.stack([torch.ones_like(near_side), torch.ones_like(near_side), near_side], dim=-1)[:, None]
-    in_camera = (points * turned * (patches.box.size / 2)[:, None]) @ patches.box.rotation.mT
-    in_camera = in_camera + patches.box.center[:, None]
-    is_before = ((eye[:, None] * turned * outward).sum(dim=-1) > PLANE) & (in_camera[..., 2] > _NEAR_M)
+    one = torch.ones_like(near_side)
+    to_camera = patches.box.rotation * (patches.box.size / 2 * torch.stack([one, one, near_side], dim=-1))[:, None]
+    in_camera = _planes(side_px, eye) @ to_camera.mT + patches.box.center[:, None]
+    half = side_px // 2
+    counts = [half * side_px, half * half, half * half]
+    before = torch.stack([eye[:, 2] * near_side, eye[:, 0], -eye[:, 0]], dim=-1) > PLANE
+    seen = before.repeat_interleave(torch.tensor(counts, device=eye.device), dim=1) & (in_camera[..., 2] > _NEAR_M)
     in_camera = torch.cat([in_camera[..., :2], in_camera[..., 2:].clamp(min=_NEAR_M)], dim=-1)
     size = eye.new_tensor([patches.camera.width, patches.camera.height])
-    place = 2 * patches.camera.project(in_camera) / size - 1
-    place = torch.where(is_before[..., None], place, -9.0).clamp(-9, 9)  # far outside: sampled as 0
+    place = (2 * patches.camera.project(in_camera) / size - 1).clamp(-9, 9)
+    place = place.masked_fill(~seen[..., None], -9.0)  # far outside: sampled as 0
     mask = patches.mask[:, None]
     pixels = torch.cat([2 * patches.image - 1, mask, torch.ones_like(mask)], dim=1)
     found = nn.functional.grid_sample(pixels.to(place), place[:, :, None], padding_mode="zeros", align_corners=False)
-    half = side_px // 2
-    side, front, rear = found.squeeze(-1).split([half * side_px, half * half, half * half], dim=-1)
+    side, front, rear = found.squeeze(-1).split(counts, dim=-1)
     ends = torch.cat([front.unflatten(-1, (half, half)), rear.unflatten(-1, (half, half))], dim=-1)
     return torch.cat([side.unflatten(-1, (half, side_px)), ends], dim=-2)
 
 
-def _planes(side_px: int, like: Tensor) -> tuple[Float[Tensor, "pixel 3"], Float[Tensor, "pixel 3"]]:
-    """Canonical points of the three planes' pixels, row by row, and which way each plane faces: left, front, rear."""
+def _planes(side_px: int, like: Tensor) -> Float[Tensor, "pixel 3"]:
+    """Canonical points of the three planes' pixels, row by row: left side, front, rear."""
     half = side_px // 2
     along, down = (_centres(count, like) for count in (side_px, half))
     y, x = torch.meshgrid(down, along, indexing="ij")
     left = torch.stack([x, y, torch.full_like(x, PLANE)], dim=-1).flatten(0, 1)
     y, z = torch.meshgrid(down, down, indexing="ij")
     front = torch.stack([torch.full_like(z, PLANE), y, z], dim=-1).flatten(0, 1)
-    rear = front * front.new_tensor([-1.0, 1.0, 1.0])
-    facing = [[0.0, 0.0, 1.0]] * len(left) + [[1.0, 0.0, 0.0]] * len(front) + [[-1.0, 0.0, 0.0]] * len(rear)
-    return torch.cat([left, front, rear]), like.new_tensor(facing)
+    return torch.cat([left, front, front * front.new_tensor([-1.0, 1.0, 1.0])])
 
 
 def _centres(count: int, like: Tensor) -> Float[Tensor, " count"]:
