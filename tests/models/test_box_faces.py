@@ -1,6 +1,7 @@
 """Photos laid out on the faces of the box: against planes painted by rays, mirrored photos, what is out of sight."""
 
 import dataclasses
+from typing import Literal
 
 import pytest
 import torch
@@ -115,9 +116,12 @@ def test_a_camera_inside_the_box_sees_nothing() -> None:
 
 
 @torch.no_grad()
-def test_its_encoder_tells_cars_apart_and_not_their_mirror_images() -> None:
+@pytest.mark.parametrize("stem_px", [2, 4])
+def test_its_encoder_tells_cars_apart_and_not_their_mirror_images(stem_px: Literal[2, 4]) -> None:
     torch.manual_seed(0)
-    encoder = build_encoder(EncoderConfig("box-faces", side_px=32, pretrained=None, num_features=48, sees_mask=True))
+    encoder = build_encoder(
+        EncoderConfig("box-faces", side_px=32, pretrained=None, num_features=48, sees_mask=True, stem_px=stem_px)
+    )
     one, other = photo(torch.rand(3, 32, 32), 35.0), photo(torch.rand(3, 32, 32), 35.0)
     assert encoder(one).shape == (1, 48)
     assert not torch.allclose(encoder(one), encoder(other), atol=1e-3)

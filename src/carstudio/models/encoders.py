@@ -42,6 +42,9 @@ class EncoderConfig:
     """Length of the feature vector (512 for resnet34 and 320 for small-pyramid, fixed)."""
     sees_mask: bool = False
     """Also feed the mask as a fourth channel ("small"; the paper's encoder sees the photo alone)."""
+    stem_px: Literal[2, 4] = 2
+    """What "box-faces" does first: 2: two convolutions that halve the side each; 4: one of 4 x 4 px that do not
+    overlap, in two thirds of the encoder's time."""
 
     def __post_init__(self) -> None:
         if self.kind == "resnet34":
@@ -133,7 +136,7 @@ class SmallEncoder(nn.Module):
 
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
-        shrinking = _shrinking(4 if config.sees_mask else 3)
+        shrinking = _shrinking(4 if config.sees_mask else 3, *SMALL_CHANNELS)
         self.convolutions = nn.Sequential(*shrinking, nn.AdaptiveAvgPool2d(4), nn.Flatten())
         self.linear = nn.Linear(SMALL_CHANNELS[-1] * 16, config.num_features)
         self.sees_mask = config.sees_mask
@@ -153,7 +156,8 @@ class BoxFacesEncoder(nn.Module):
         super().__init__()
         self.side_px = config.side_px
         last = SMALL_CHANNELS[-1]
-        self.convolutions = nn.Sequential(*_shrinking(CHANNELS), ResidualConvolutions(last), nn.Flatten())
+        shrinking = _shrinking(CHANNELS, *SMALL_CHANNELS) if config.stem_px == 2 else _shrinking_from_patches(CHANNELS)
+        self.convolutions = nn.Sequential(*shrinking, ResidualConvolutions(last), nn.Flatten())
         self.linear = nn.Linear(last * (config.side_px // 2 ** len(SMALL_CHANNELS)) ** 2, config.num_features)
 
     def forward(self, patches: PatchBatch) -> Float[Tensor, "batch feature"]:
@@ -161,12 +165,19 @@ class BoxFacesEncoder(nn.Module):
         return nn.functional.silu(self.linear(self.convolutions(box_faces(patches, self.side_px))))
 
 
-def _shrinking(channels: int) -> list[nn.Module]:
-    """Convolutions that halve the side each, from `channels` through `SMALL_CHANNELS`."""
+def _shrinking(*channels: int) -> list[nn.Module]:
+    """Convolutions that halve the side each, from and to so many channels."""
     layers: list[nn.Module] = []
-    for inside, outside in pairwise((channels, *SMALL_CHANNELS)):
+    for inside, outside in pairwise(channels):
         layers += [nn.Conv2d(inside, outside, 3, stride=2, padding=1), nn.GroupNorm(8, outside), nn.SiLU()]
     return layers
+
+
+def _shrinking_from_patches(channels: int) -> list[nn.Module]:
+    """The same size at the end, the first two convolutions replaced by one of patches."""
+    width = SMALL_CHANNELS[1]
+    stem = [nn.Conv2d(channels, width, 4, stride=4), nn.GroupNorm(8, width), nn.SiLU()]
+    return [*stem, *_shrinking(*SMALL_CHANNELS[1:])]
 
 
 class ResidualConvolutions(nn.Module):
