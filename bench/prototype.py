@@ -49,11 +49,13 @@ def prototype() -> TrainConfig:
         loss=LossConfig(colour="whole-crop"),
         schedule=ScheduleConfig(first=5e-3, last=1e-4, decay_steps=None, warmup_steps=100),
         optimizer="radam",
+        second_moment=0.999,
         template_rate=1.0,
         mirroring="off",
         box_noise=0.0,
         patches_per_step=16,
         rays_per_patch=512,
+        pixels="anywhere",
     )
 
 

@@ -1,7 +1,9 @@
 from collections import Counter
+from statistics import fmean, stdev
 
 import pytest
 import torch
+from torch import Tensor
 
 from carstudio.dataset.pixels import PatchCache, mirror_patch, prepare_patch
 from carstudio.dataset.store import PatchStore
@@ -11,6 +13,7 @@ from carstudio.training.batches import (
     HEADING_NOISE_DEG,
     PLACE_NOISE,
     SIZE_NOISE,
+    PixelDraws,
     StepSampler,
     generator_for,
     noisy_box,
@@ -87,6 +90,41 @@ def test_more_rays_than_pixels_is_no_problem(store: PatchStore) -> None:
     """Released code crashes when a patch has fewer pixels than rays."""
     prepared = prepare_patch(store.patch("toy-0-0"), 32)
     assert pixel_batch([prepared], 10_000, torch.Generator().manual_seed(0)).rgb.shape == (1, 10_000, 3)
+
+
+def drawn_places(store: PatchStore, count: int, draws: PixelDraws, seed: int) -> tuple[Tensor, Tensor]:
+    """Columns and rows of drawn pixels."""
+    prepared = prepare_patch(store.patch("toy-1-2"), 32)
+    pixels = pixel_batch([prepared], count, torch.Generator().manual_seed(seed), draws)
+    column, row = prepared.camera.project(pixels.rays.directions[0]).floor().long().unbind(-1)
+    return column, row
+
+
+def test_one_pixel_from_each_cell_and_the_rest_anywhere(store: PatchStore) -> None:
+    column, row = drawn_places(store, 70, "in-cells", seed=3)
+    in_cells = torch.stack([row[:64] * 8 // SIDE_PX, column[:64] * 8 // SIDE_PX], dim=-1)  # 8 x 8 cells of whole pixels
+    assert SIDE_PX % 8 == 0
+    assert in_cells.tolist() == [[cell // 8, cell % 8] for cell in range(64)]
+    assert len(set(zip(row.tolist(), column.tolist(), strict=True))) > 60
+    assert not torch.equal(column[64:], drawn_places(store, 70, "in-cells", seed=4)[0][64:])
+
+
+def test_cells_draw_all_pixels_equally_often_and_means_with_less_noise(store: PatchStore) -> None:
+    """49 cells of fractions of pixels; the mean of a smooth function over the crop is known."""
+    counts = torch.zeros(SIDE_PX, SIDE_PX)
+    means: dict[PixelDraws, list[float]] = {"anywhere": [], "in-cells": []}
+    for seed in range(600):
+        for draws, found in means.items():
+            column, row = drawn_places(store, 49, draws, seed)
+            found.append(float((column + 2 * row).float().mean()))
+            if draws == "in-cells":
+                counts.index_put_((row, column), torch.ones(49), accumulate=True)
+    expected = 600 * 49 / SIDE_PX**2
+    assert float(((counts - expected) ** 2 / expected).sum()) < SIDE_PX**2 + 5 * (2 * SIDE_PX**2) ** 0.5  # chi-square
+    truth = 1.5 * (SIDE_PX - 1)
+    for found in means.values():
+        assert abs(fmean(found) - truth) < 4 * stdev(found) / 600**0.5
+    assert stdev(means["in-cells"]) < 0.3 * stdev(means["anywhere"])
 
 
 def test_the_cache_forgets_the_oldest_and_changes_nothing(store: PatchStore) -> None:

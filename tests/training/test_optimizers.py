@@ -102,11 +102,15 @@ def test_a_templates_numbers_learn_at_their_own_rate() -> None:
     ("name", "reference"),
     [("radam", torch.optim.RAdam), ("adamw", torch.optim.AdamW), ("adam", torch.optim.Adam)],
 )
-def test_each_optimiser_is_torchs(name: str, reference: type[torch.optim.Optimizer]) -> None:
+@pytest.mark.parametrize("second_moment", [0.999, 0.9])
+def test_each_optimiser_is_torchs(name: str, reference: type[torch.optim.Optimizer], second_moment: float) -> None:
     torch.manual_seed(0)
     ours, theirs = (build_model(CodeNeRFConfig(code_size=8, width=16, cars=("a",))) for _ in range(2))
     theirs.load_state_dict(ours.state_dict())
-    pair = build_optimizer(ours, name, rate=1e-2), reference(theirs.parameters(), lr=1e-2, eps=1e-8)  # type: ignore[arg-type,call-arg]
+    pair = (
+        build_optimizer(ours, name, rate=1e-2, second_moment=second_moment),  # type: ignore[arg-type]
+        reference(theirs.parameters(), lr=1e-2, betas=(0.9, second_moment), eps=1e-8),  # type: ignore[call-arg]
+    )
     for step in range(8):
         for model, optimizer in zip((ours, theirs), pair, strict=True):
             generator = torch.Generator().manual_seed(step)

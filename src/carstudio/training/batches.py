@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from carstudio.dataset.patch import MaskValue
@@ -25,6 +25,7 @@ from carstudio.rendering.rays import Rays, pixel_rays
 
 Supervision = Literal["single-view", "multi-view", "mixed"]
 Mirroring = Literal["off", "together", "apart"]
+PixelDraws = Literal["anywhere", "in-cells"]
 # Standard deviations of labelled boxes' errors: place (share of the size), heading (degrees), size (share)
 PLACE_NOISE, HEADING_NOISE_DEG, SIZE_NOISE = 0.03, 3.0, 0.03
 _STREAMS = {"epoch": 1, "target": 2, "pixels": 3, "jitter": 4, "mirror": 5, "box": 6}
@@ -113,17 +114,21 @@ def stack_boxes(boxes: list[Box3D]) -> Box3D:
 
 
 def pixel_batch(
-    patches: list[PreparedPatch], rays_per_patch: int, generators: torch.Generator | Sequence[torch.Generator]
+    patches: list[PreparedPatch],
+    rays_per_patch: int,
+    generators: torch.Generator | Sequence[torch.Generator],
+    draws: PixelDraws = "anywhere",
 ) -> PixelBatch:
     """Pixels drawn evenly, with replacement, from the whole crop of each patch (patches of any size will do).
 
     By one generator in turn, or by one for each patch, so that a patch's pixels do not depend on the others.
+    "in-cells" draws the same means with less noise: one pixel from each of n x n equal cells, the rest anywhere.
     """
     each = [generators] * len(patches) if isinstance(generators, torch.Generator) else generators
     positions, rgb, mask = [], [], []
     for patch, generator in zip(patches, each, strict=True):
         height, width = patch.mask.shape
-        picked = torch.randint(height * width, (rays_per_patch,), generator=generator)
+        picked = _picked(height, width, rays_per_patch, generator, draws)
         positions.append(torch.stack([picked % width, picked // width], dim=-1).float() + 0.5)
         rgb.append(patch.rgb.view(-1, 3)[picked])
         mask.append(patch.mask.view(-1)[picked])
@@ -136,6 +141,19 @@ def pixel_batch(
         alpha=(values == MaskValue.CAR).float(),
         is_known=values != MaskValue.UNKNOWN,
     )
+
+
+def _picked(height: int, width: int, count: int, generator: torch.Generator, draws: PixelDraws) -> Int[Tensor, " ray"]:
+    """Numbers of drawn pixels, counted row by row."""
+    cells = math.isqrt(count) if draws == "in-cells" else 0
+    anywhere = torch.randint(height * width, (count - cells**2,), generator=generator)
+    if not cells:
+        return anywhere
+    drawn = torch.rand(2, cells, cells, generator=generator)
+    numbers = torch.arange(cells)
+    row = ((numbers[:, None] + drawn[0]) * (height / cells)).long().clamp(max=height - 1)
+    column = ((numbers + drawn[1]) * (width / cells)).long().clamp(max=width - 1)
+    return torch.cat([(row * width + column).flatten(), anywhere])
 
 
 class StepSampler:
@@ -159,9 +177,10 @@ class StepSampler:
         seed: int,
         mirroring: Mirroring = "off",
         box_noise: float = 0.0,
+        pixels: PixelDraws = "anywhere",
     ) -> None:
         assert patch_ids, "no patches to train on"
-        self.mirroring, self.box_noise = mirroring, box_noise
+        self.mirroring, self.box_noise, self.pixels = mirroring, box_noise, pixels
         self.cache, self.patch_ids, self.seed = cache, patch_ids, seed
         self.patches_per_step, self.supervision = patches_per_step, supervision
         table = cache.store.table(["patch_id", "instance_id"])
@@ -220,7 +239,7 @@ class StepSampler:
             ]
         explained = [self._patch(targets[row], flips[row][1]) for row in rows]
         generators = [generator_for(self.seed, step, "pixels", row) for row in rows]
-        return patch_batch(shown), pixel_batch(explained, rays_per_patch, generators)
+        return patch_batch(shown), pixel_batch(explained, rays_per_patch, generators, self.pixels)
 
     def _patch(self, patch_id: str, is_mirrored: bool) -> PreparedPatch:
         return mirror_patch(self.cache[patch_id]) if is_mirrored else self.cache[patch_id]

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 from carstudio.models.car_nerf import CarNeRFConfig
 from carstudio.models.zoo import ModelConfig
-from carstudio.training.batches import Mirroring, Supervision
+from carstudio.training.batches import Mirroring, PixelDraws, Supervision
 from carstudio.training.losses import LossConfig
 from carstudio.training.optimizers import OptimizerName
 from carstudio.training.precision import Precision
@@ -33,6 +33,8 @@ class TrainConfig:
     """Cars encoded per step."""
     rays_per_patch: int = 1024
     """Pixels per patch and step."""
+    pixels: PixelDraws = "anywhere"
+    """"anywhere": each pixel drawn from the whole crop; "in-cells": one from each cell of a grid laid over it."""
     steps: int = 500_000
     """Length of the run."""
     minutes: float | None = None
@@ -42,6 +44,8 @@ class TrainConfig:
     follows them. What rows of a table have in common."""
     optimizer: OptimizerName = "radam"
     """radam: the paper's; adamw: CodeNeRF's; adam: one fused kernel, the least work per step."""
+    second_moment: float = 0.999
+    """Adam's beta_2, whichever of the three: how slowly the mean of squared gradients forgets."""
     code_rate: float = 1.0
     """Learning rate of codes that are kept per car (CodeNeRF), as a multiple of the schedule's."""
     template_rate: float = 1.0

@@ -11,7 +11,13 @@ EPSILON = 1e-8  # the paper's
 
 
 def build_optimizer(
-    model: CategoryModel, name: OptimizerName, *, rate: float, code_rate: float = 1.0, template_rate: float = 1.0
+    model: CategoryModel,
+    name: OptimizerName,
+    *,
+    rate: float,
+    second_moment: float = 0.999,
+    code_rate: float = 1.0,
+    template_rate: float = 1.0,
 ) -> torch.optim.Optimizer:
     """The optimiser over a model's parameters; each group's `multiple` times the schedule's rate is its rate.
 
@@ -26,8 +32,9 @@ def build_optimizer(
     for parameters, multiple in own:
         if parameters:
             groups.append({"params": list(parameters), "multiple": multiple, "lr": rate * multiple})
+    betas = (0.9, second_moment)
     if name == "radam":
-        return torch.optim.RAdam(groups, lr=rate, eps=EPSILON)
+        return torch.optim.RAdam(groups, lr=rate, betas=betas, eps=EPSILON)
     if name == "adamw":
-        return torch.optim.AdamW(groups, lr=rate, eps=EPSILON)
-    return torch.optim.Adam(groups, lr=rate, eps=EPSILON, fused=True)
+        return torch.optim.AdamW(groups, lr=rate, betas=betas, eps=EPSILON)
+    return torch.optim.Adam(groups, lr=rate, betas=betas, eps=EPSILON, fused=True)

@@ -170,6 +170,7 @@ class _Run:
             self.model,
             config.optimizer,
             rate=config.schedule.first,
+            second_moment=config.second_moment,
             code_rate=config.code_rate,
             template_rate=config.template_rate,
         )
@@ -184,6 +185,7 @@ class _Run:
             seed=config.seed,
             mirroring=config.mirroring,
             box_noise=config.box_noise,
+            pixels=config.pixels,
         )
 
     def begin(self, *, init: Path | None) -> None:
