@@ -66,9 +66,11 @@ class Team:
         numbers = torch.tensor([weight, *(weight * value for value in means), *said, *sums], dtype=torch.float32)
         with_gradient = [p for p in parameters if p.grad is not None]
         gradients = [p.grad for p in with_gradient if p.grad is not None]
-        flat = torch.cat([numbers.to(parameters[0].device), *(g.flatten() * weight for g in gradients)])
+        flat = torch.cat([numbers.to(parameters[0].device), *(g.flatten() for g in gradients)])
+        rest = flat[len(numbers) :].mul_(weight)
         self._sum(flat)
-        numbers, rest = flat[: len(numbers)].cpu(), flat[len(numbers) :] / flat[0].clamp(min=1e-8)
+        numbers = flat[: len(numbers)].cpu()
+        rest.div_(flat[0].clamp(min=1e-8))
         for parameter, part in zip(with_gradient, rest.split([g.numel() for g in gradients]), strict=True):
             parameter.grad = part.view_as(parameter)
         total = max(float(numbers[0]), 1e-8)
