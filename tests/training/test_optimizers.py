@@ -21,7 +21,7 @@ from carstudio.training.checkpoint import load_model
 from carstudio.training.config import TrainConfig
 from carstudio.training.log import read_log
 from carstudio.training.losses import LossConfig, code_length, mask_error
-from carstudio.training.optimizers import build_optimizer
+from carstudio.training.optimizers import build_optimizer, clip
 from carstudio.training.resume import load_state
 from carstudio.training.trainer import train
 from training.toy import TINY, toy_store
@@ -64,6 +64,18 @@ def test_the_cars_codes_are_trained_and_found_again(store: PatchStore, tmp_path:
     trained = load_model(tmp_path)
     assert trained.config.cars == tuple(f"toy-{car}" for car in range(5))
     assert "codes" in read_log(tmp_path / "log.jsonl")[-1]
+
+
+@pytest.mark.parametrize("largest", [0.5, 100.0])
+def test_gradients_are_clipped_as_torch_clips_them(largest: float) -> None:
+    ours, theirs = ([torch.nn.Parameter(torch.zeros(n)) for n in (3, 40, 5)] for _ in range(2))
+    for mine, other in zip(ours[:2], theirs[:2], strict=True):  # the third has no gradient
+        mine.grad = torch.randn(mine.shape, generator=torch.Generator().manual_seed(len(mine)))
+        other.grad = mine.grad.clone()
+    clip(ours, largest)
+    torch.nn.utils.clip_grad_norm_(theirs, largest)
+    for mine, other in zip(ours[:2], theirs[:2], strict=True):
+        assert torch.equal(torch.as_tensor(mine.grad), torch.as_tensor(other.grad))
 
 
 def test_codes_learn_at_their_own_rate() -> None:

@@ -1,5 +1,6 @@
 """Who takes a training step: the optimisers a recipe may name, codes kept per car at a rate of their own."""
 
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
@@ -8,6 +9,13 @@ from carstudio.models.interface import CategoryModel
 
 OptimizerName = Literal["radam", "adamw", "adam"]
 EPSILON = 1e-8  # the paper's
+
+
+def clip(parameters: Sequence[torch.nn.Parameter], largest: float) -> None:
+    """Shorten the gradients to that norm, all as one vector, where they are longer; short ones are not touched."""
+    norm = torch.nn.utils.get_total_norm([p.grad for p in parameters if p.grad is not None])
+    if float(norm) > largest:
+        torch.nn.utils.clip_grads_with_norm_(parameters, largest, norm)
 
 
 def build_optimizer(

@@ -26,7 +26,7 @@ from carstudio.training.checkpoint import describe_model, load_weights_of, save_
 from carstudio.training.config import TrainConfig
 from carstudio.training.log import LOG, TrainingLog
 from carstudio.training.losses import code_length, masked_psnr, training_loss
-from carstudio.training.optimizers import build_optimizer
+from carstudio.training.optimizers import build_optimizer, clip
 from carstudio.training.precision import autocast, resolve_precision
 from carstudio.training.resume import STATE, TrainingState, load_state, save_state
 from carstudio.training.schedule import learning_rate
@@ -271,7 +271,7 @@ class _Run:
         figures, self.is_stopped = dict(zip(terms, values, strict=True)), stops > 0
         self._refuse_nan(figures, patches.instance_ids)
         if config.clip_gradient is not None:
-            torch.nn.utils.clip_grad_norm_(self.model.parameters(), config.clip_gradient)
+            clip(list(self.model.parameters()), config.clip_gradient)
         self.optimizer.step()
 
         self.step += 1
