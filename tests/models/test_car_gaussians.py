@@ -10,13 +10,15 @@ import torch
 from carstudio.dataset.store import PatchStore
 from carstudio.errors import InputError
 from carstudio.evaluation.protocols import EvaluationConfig, score_views, view_pairs
-from carstudio.geometry.box3d import Box3D
+from carstudio.geometry.box3d import Box3D, mirror_box
 from carstudio.geometry.camera import Camera
+from carstudio.geometry.canonical import canonical_from_camera
 from carstudio.geometry.orbit import orbit_box, orbit_camera
-from carstudio.models.car_gaussians import CarGaussians, CarGaussiansConfig
+from carstudio.models.car_gaussians import CarGaussians, CarGaussiansConfig, exchanged
 from carstudio.models.encoders import EncoderConfig
 from carstudio.models.gaussian_template import EXTENT, surface_template
 from carstudio.models.interface import CategoryModel, Latents, PatchBatch, render_image, window_of
+from carstudio.models.left_views import as_left_views
 from carstudio.models.zoo import config_from_json, config_to_json
 from carstudio.recipes import RECIPES, recipe
 from carstudio.rendering.rays import image_rays, to_canonical
@@ -240,3 +242,82 @@ def test_reduced_precision_ends_at_the_codes() -> None:
         reduced = model.render(rays, latents, patches.box)
     assert torch.equal(plain.rgb, reduced.rgb)
     assert torch.equal(plain.opacity, reduced.opacity)
+
+
+LEFT = dataclasses.replace(SMALL, encodes_left_views=True)
+
+
+def mirrored(patches: PatchBatch) -> PatchBatch:
+    """The photos flipped left to right, of the mirrored cars."""
+    return PatchBatch(
+        patches.image.flip(3),
+        patches.mask.flip(2),
+        patches.camera.flip(),
+        mirror_box(patches.box),
+        patches.instance_ids,
+    )
+
+
+def moved_model() -> CarGaussians:
+    """One whose colours are tinted and whose Gaussians depend on the photo, unlike before the first step."""
+    model = small_model(encodes_left_views=True)
+    generator = torch.Generator().manual_seed(5)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(torch.randn(parameter.shape, generator=generator) * 0.1)
+    return model
+
+
+def test_left_views_are_the_photos_of_the_left_and_the_mirror_images_of_the_others() -> None:
+    patches = batch(6)  # azimuths 10 to 260 degrees
+    turned, side = as_left_views(patches)
+    eye = canonical_from_camera(patches.box)[:, 2, 3]
+    assert side.tolist() == eye.sign().tolist()
+    assert 0 < int((side > 0).sum()) < 6
+    assert bool((canonical_from_camera(turned.box)[:, 2, 3] > 0).all())
+    other = mirrored(patches)
+    for row, where in enumerate(side.tolist()):
+        expected = patches if where > 0 else other
+        assert torch.equal(turned.image[row], expected.image[row])
+        assert torch.equal(turned.mask[row], expected.mask[row])
+        assert torch.equal(turned.camera.intrinsics[row], expected.camera.intrinsics[row])
+        for name in ("center", "size", "rotation"):
+            assert torch.equal(getattr(turned.box, name)[row], getattr(expected.box, name)[row])
+
+
+@torch.no_grad()
+def test_a_mirrored_photo_gives_the_mirrored_car() -> None:
+    """Codes are the same but for the side, and pictures are each other's mirror images, tint and all."""
+    model, patches = moved_model(), batch(6)
+    own, other = model.encode(patches), model.encode(mirrored(patches))
+    assert torch.allclose(own.shape, other.shape, atol=1e-6)
+    assert own.texture.shape == (6, SMALL.code_size + 1)
+    assert torch.allclose(own.texture[:, :-1], other.texture[:, :-1], atol=1e-6)
+    assert torch.equal(own.texture[:, -1], -other.texture[:, -1])
+    assert sorted(set(own.texture[:, -1].tolist())) == [-1, 1]
+    half = SMALL.num_splats // 2
+    for row in range(6):
+        clouds = model.decode(own.select(row)), model.decode(other.select(row))
+        assert not torch.allclose(clouds[0].rgb[:, :half], clouds[0].rgb[:, half:], atol=1e-3)
+        camera, box = orbit_camera(40), patches.box.select(slice(row, row + 1))
+        turned = orbit_box(box.size[0], azimuth_deg=75.0, elevation_deg=20.0, distance_m=8.0)
+        turned = Box3D(turned.center[None], turned.size[None], turned.rotation[None])
+        picture = render_image(model, camera, own.select(row), turned)
+        mirror = render_image(model, camera.flip(), other.select(row), mirror_box(turned))
+        for name in ("rgb", "opacity", "depth_m"):
+            assert torch.allclose(picture[name], mirror[name].flip(1), atol=2e-4), name
+
+
+def test_between_the_sides_colours_are_mixed() -> None:
+    rgb, tint = torch.rand(1, 8, 3), torch.randn(1, 8, 3, 3)
+    left, right, middle = (exchanged(rgb, tint, torch.tensor([side])) for side in (1.0, -1.0, 0.0))
+    assert torch.equal(left[0], rgb)
+    assert left[1] is not None
+    assert right[1] is not None
+    assert torch.equal(left[1], tint)
+    assert torch.equal(right[0][:, :4], rgb[:, 4:])
+    assert torch.equal(right[1][:, 4:], tint[:, :4] * torch.tensor([1.0, 1.0, -1.0]))
+    assert torch.allclose(middle[0], (left[0] + right[0]) / 2)
+    assert exchanged(rgb, None, torch.ones(1))[1] is None
+    with pytest.raises(AssertionError, match="mirrored pairs"):
+        dataclasses.replace(LEFT, is_symmetric=False)

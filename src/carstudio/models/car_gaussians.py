@@ -14,6 +14,7 @@ from carstudio.geometry.box3d import Box3D
 from carstudio.models.encoders import EncoderConfig, build_encoder, load_imagenet
 from carstudio.models.gaussian_template import surface_template
 from carstudio.models.interface import CategoryModel, Latents, PatchBatch
+from carstudio.models.left_views import as_left_views
 from carstudio.models.patch_features import POSE_FEATURES, pose_features, tiny_masked_copy
 from carstudio.rendering.gaussians.cloud import GaussianCloud
 from carstudio.rendering.gaussians.tiles import TILE_PX
@@ -44,6 +45,9 @@ class CarGaussiansConfig:
     """Residual blocks of each decoder after its first layer."""
     is_symmetric: bool = True
     """Gaussians come in pairs mirrored in the car's middle plane; colours are free."""
+    encodes_left_views: bool = False
+    """Photos of right sides are encoded as the left views that they are in a mirror, and colours change sides after
+    decoding; a number at the end of the texture code tells the side (1 left, -1 right, between them a mixture)."""
     colour_skip_px: int = 8
     """Side of a tiny copy of the masked crop, added to the texture code by a linear map; 0: none."""
     tint_width: int = 64
@@ -56,6 +60,7 @@ class CarGaussiansConfig:
 
     def __post_init__(self) -> None:
         assert not self.is_symmetric or self.num_splats % 2 == 0, "mirrored pairs need an even number of Gaussians"
+        assert self.is_symmetric or not self.encodes_left_views, "only mirrored pairs can exchange their colours"
         assert 0 < self.least_scale < self.largest_scale, "scales are positive, the least below the largest"
 
 
@@ -99,17 +104,23 @@ class CarGaussians(CategoryModel):
 
     def encode(self, patches: PatchBatch) -> Latents:
         """Codes of shape and texture."""
+        if self.config.encodes_left_views:
+            patches, side = as_left_views(patches)
         features = torch.cat([self.encoder(patches), pose_features(patches)], dim=-1)
         texture = self.texture_head(features)
         if self.config.colour_skip_px:
             texture = texture + self.colour_skip(tiny_masked_copy(patches, self.config.colour_skip_px))
         shape, texture = self.shape_norm(self.shape_head(features)), self.texture_norm(texture)
+        if self.config.encodes_left_views:
+            texture = torch.cat([texture, side[:, None].to(texture)], dim=-1)
         return Latents(shape, texture)
 
     def decode(self, latents: Latents) -> GaussianCloud:
         """The car's Gaussians in the canonical frame."""
         mean, log_scale, quaternion, opacity = self.geometry(latents.shape)
         rgb, tint = self.colour(latents)
+        if self.config.encodes_left_views:
+            rgb, tint = exchanged(rgb, tint, latents.texture[:, -1])
         return GaussianCloud(mean, log_scale, quaternion, opacity, rgb, tint)
 
     def trace_levels(
@@ -127,6 +138,21 @@ class CarGaussians(CategoryModel):
         with torch.autocast(rays.directions.device.type, enabled=False):
             cloud = self.decode(_exact(latents, rays))
             return (render_cloud(cloud, rays, to_canonical(rays, box), self.config.splatting),)
+
+
+def exchanged(
+    rgb: Float[Tensor, "batch splat 3"], tint: Float[Tensor, "batch splat 3 3"] | None, side: Float[Tensor, " batch"]
+) -> tuple[Float[Tensor, "batch splat 3"], Float[Tensor, "batch splat 3 3"] | None]:
+    """Colours as they are for side 1, those of the mirror twins for side -1, mixed in between.
+
+    A Gaussian's twin stands half the number of Gaussians further on; its tint sees a line of sight mirrored in z.
+    """
+    share, half = ((1 + side) / 2)[:, None, None], rgb.shape[1] // 2
+    rgb = share * rgb + (1 - share) * rgb.roll(half, dims=1)
+    if tint is not None:
+        twins = tint.roll(half, dims=1) * tint.new_tensor([1.0, 1.0, -1.0])
+        tint = share[..., None] * tint + (1 - share[..., None]) * twins
+    return rgb, tint
 
 
 def _exact(latents: Latents, rays: Rays) -> Latents:
@@ -219,7 +245,8 @@ class ColourDecoder(nn.Module):
         self, latents: Latents
     ) -> tuple[Float[Tensor, "batch splat 3"], Float[Tensor, "batch splat 3 3"] | None]:
         """Colours in [0, 1], and their change with the line of sight where the config asks for one."""
-        hidden = self.hidden(torch.cat([latents.texture, latents.shape.detach()], dim=-1))
+        texture = latents.texture[:, : self.config.code_size]
+        hidden = self.hidden(torch.cat([texture, latents.shape.detach()], dim=-1))
         colours = torch.sigmoid(self.colours(hidden).unflatten(-1, (-1, 3)))
         tint = self.tint(hidden).unflatten(-1, (-1, 3, 3)) if self.config.tint_width else None
         return colours, tint
