@@ -67,14 +67,21 @@ def car_gaussians() -> TrainConfig:
     encoder = EncoderConfig(kind="box-faces", side_px=64, stem_px=4, pretrained=None, num_features=256, sees_mask=True)
     return TrainConfig(
         recipe="car-gaussians",
-        model=CarGaussiansConfig(encoder=encoder, code_size=256, width=512, blocks=1, encodes_left_views=True),
+        model=CarGaussiansConfig(
+            encoder=encoder,
+            code_size=256,
+            width=512,
+            blocks=1,
+            encodes_left_views=True,
+            starts_from_brightness=True,
+            has_light=True,
+        ),
         loss=LossConfig(colour="whole-crop", mask_weight=0.3, exposed_share=0.5, photo_error="log"),
         schedule=ScheduleConfig(first=6e-4, last=6e-6, decay="linear", decay_steps=None, warmup_steps=100),
         optimizer="adam",
         second_moment=0.99,
         template_rate=10.0,
         supervision="mixed",
-        mirroring="together",
         box_noise=1.0,
         patches_per_step=32,
         rays_per_patch=256,

@@ -2,6 +2,7 @@
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from carstudio.export.splats import canonical_cloud, metric_splats, read_ply, wr
 from carstudio.geometry.box3d import Box3D
 from carstudio.geometry.orbit import orbit_box, orbit_camera
 from carstudio.models.interface import CategoryModel, Latents, render_image
-from carstudio.rendering.gaussians.cloud import GaussianCloud
+from carstudio.rendering.gaussians.cloud import GaussianCloud, light_terms
 from carstudio.rendering.gaussians.tracing import SplattingConfig, render_cloud
 from carstudio.rendering.rays import Rays, image_rays, to_canonical
 from carstudio.rendering.volume import Segments
@@ -112,6 +113,21 @@ def test_tinted_colours_as_viewers_compute_them(tmp_path: Path, cloud: GaussianC
         flat = np.abs(cloud.rgb[0].numpy() - ours).max()
         assert errors[-1] < 0.5 * flat  # the tint is there, and the right way round
     assert max(errors) < 0.12  # degree 1 is not the whole of it
+
+
+def test_of_light_only_what_is_alike_from_everywhere_is_written(cloud: GaussianCloud) -> None:
+    """The others' mean over all directions is 0, so the file is as bright as the car is on the (geometric) mean."""
+    light = torch.randn(1, 9, 3, generator=torch.Generator().manual_seed(2)) * 0.3
+    lit, plain = metric_splats(replace(cloud, rgb=cloud.rgb * 0.5, light=light), SIZE), metric_splats(cloud, SIZE)
+    torch.testing.assert_close(lit.rgb, (cloud.rgb[0] * 0.5 * light[0, 0].exp()).clamp(max=1))
+    assert lit.tint is not None
+    assert plain.tint is not None
+    torch.testing.assert_close(lit.tint, plain.tint * light[0, 0].exp()[:, None])
+    directions = torch.nn.functional.normalize(
+        torch.randn(200_000, 3, generator=torch.Generator().manual_seed(3)), dim=-1
+    )
+    means = torch.stack(light_terms(*directions.unbind(-1))).mean(dim=1)
+    assert float((means - torch.eye(9)[0]).abs().max()) < 0.01
 
 
 def test_other_files_are_refused(tmp_path: Path, cloud: GaussianCloud) -> None:

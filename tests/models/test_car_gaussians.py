@@ -4,6 +4,7 @@ import dataclasses
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -14,13 +15,14 @@ from carstudio.geometry.box3d import Box3D, mirror_box
 from carstudio.geometry.camera import Camera
 from carstudio.geometry.canonical import canonical_from_camera
 from carstudio.geometry.orbit import orbit_box, orbit_camera
-from carstudio.models.car_gaussians import CarGaussians, CarGaussiansConfig, exchanged
+from carstudio.models.car_gaussians import CarGaussians, CarGaussiansConfig, brightness_logit, exchanged
 from carstudio.models.encoders import EncoderConfig
 from carstudio.models.gaussian_template import EXTENT, surface_template
 from carstudio.models.interface import CategoryModel, Latents, PatchBatch, render_image, window_of
 from carstudio.models.left_views import as_left_views
 from carstudio.models.zoo import config_from_json, config_to_json
 from carstudio.recipes import RECIPES, recipe
+from carstudio.rendering.gaussians.ellipses import bake_cloud
 from carstudio.rendering.rays import image_rays, to_canonical
 from carstudio.rendering.volume import composite
 from carstudio.training.checkpoint import load_model, save_model
@@ -244,7 +246,7 @@ def test_reduced_precision_ends_at_the_codes() -> None:
     assert torch.equal(plain.opacity, reduced.opacity)
 
 
-LEFT = dataclasses.replace(SMALL, encodes_left_views=True)
+LEFT = dataclasses.replace(SMALL, encodes_left_views=True, starts_from_brightness=True, has_light=True)
 
 
 def mirrored(patches: PatchBatch) -> PatchBatch:
@@ -260,7 +262,8 @@ def mirrored(patches: PatchBatch) -> PatchBatch:
 
 def moved_model() -> CarGaussians:
     """One whose colours are tinted and whose Gaussians depend on the photo, unlike before the first step."""
-    model = small_model(encodes_left_views=True)
+    torch.manual_seed(1)
+    model = CarGaussians(LEFT).eval()
     generator = torch.Generator().manual_seed(5)
     with torch.no_grad():
         for parameter in model.parameters():
@@ -291,10 +294,11 @@ def test_a_mirrored_photo_gives_the_mirrored_car() -> None:
     model, patches = moved_model(), batch(6)
     own, other = model.encode(patches), model.encode(mirrored(patches))
     assert torch.allclose(own.shape, other.shape, atol=1e-6)
-    assert own.texture.shape == (6, SMALL.code_size + 1)
-    assert torch.allclose(own.texture[:, :-1], other.texture[:, :-1], atol=1e-6)
-    assert torch.equal(own.texture[:, -1], -other.texture[:, -1])
-    assert sorted(set(own.texture[:, -1].tolist())) == [-1, 1]
+    assert own.texture.shape == (6, SMALL.code_size + 2)
+    same, side = [*range(SMALL.code_size), SMALL.code_size + 1], SMALL.code_size
+    assert torch.allclose(own.texture[:, same], other.texture[:, same], atol=1e-6)
+    assert torch.equal(own.texture[:, side], -other.texture[:, side])
+    assert sorted(set(own.texture[:, side].tolist())) == [-1, 1]
     half = SMALL.num_splats // 2
     for row in range(6):
         clouds = model.decode(own.select(row)), model.decode(other.select(row))
@@ -310,7 +314,8 @@ def test_a_mirrored_photo_gives_the_mirrored_car() -> None:
 
 def test_between_the_sides_colours_are_mixed() -> None:
     rgb, tint = torch.rand(1, 8, 3), torch.randn(1, 8, 3, 3)
-    left, right, middle = (exchanged(rgb, tint, torch.tensor([side])) for side in (1.0, -1.0, 0.0))
+    light = torch.randn(1, 9, 3)
+    left, right, middle = (exchanged(rgb, tint, light, torch.tensor([side])) for side in (1.0, -1.0, 0.0))
     assert torch.equal(left[0], rgb)
     assert left[1] is not None
     assert right[1] is not None
@@ -318,6 +323,52 @@ def test_between_the_sides_colours_are_mixed() -> None:
     assert torch.equal(right[0][:, :4], rgb[:, 4:])
     assert torch.equal(right[1][:, 4:], tint[:, :4] * torch.tensor([1.0, 1.0, -1.0]))
     assert torch.allclose(middle[0], (left[0] + right[0]) / 2)
-    assert exchanged(rgb, None, torch.ones(1))[1] is None
+    assert left[2] is not None
+    assert torch.equal(left[2], light)
+    assert exchanged(rgb, None, None, torch.ones(1))[1:] == (None, None)
     with pytest.raises(AssertionError, match="mirrored pairs"):
         dataclasses.replace(LEFT, is_symmetric=False)
+
+
+def test_colours_start_from_the_brightness_of_the_photographed_car() -> None:
+    patches = batch(2)
+    patches.image[0][:, patches.mask[0] == 1] = torch.tensor([[0.1], [0.2], [0.6]])
+    patches.mask[1] = 0
+    assert torch.allclose(brightness_logit(patches), torch.tensor([math.log(0.3 / 0.7), 0.0]), atol=1e-6)
+    model = CarGaussians(LEFT)
+    shape, code = torch.zeros(2, 1, LEFT.code_size)
+    grey = [model.decode(Latents(shape, torch.cat([code, torch.tensor([[1, level]])], dim=1))).rgb for level in (0, 2)]
+    assert torch.allclose(torch.logit(grey[1]) - torch.logit(grey[0]), torch.full_like(grey[0], 2.0), atol=1e-4)
+
+
+@torch.no_grad()
+def test_light_is_a_factor_by_the_side_the_camera_is_on() -> None:
+    """Against the harmonics written out for a few directions, near and far, mirrored and baked."""
+    model = moved_model()
+    cloud = model.decode(model.encode(batch()))
+    assert cloud.light is not None
+    dark = dataclasses.replace(cloud, light=None, tint=None, rgb=cloud.rgb * 0.3)
+    light = cloud.light * 0.3
+    for eye, terms in (
+        ((5.0, 0.0, 0.0), (1, 1, 0, 0, 0, 0, 0, 1, -1)),
+        ((0.0, 2.0, 0.0), (1, 0, 1, 0, 0, 0, 0, 0, 2)),
+        ((0.0, 3.0, -4.0), (1, 0, 0.6, -0.8, 0, 0, -0.48, -0.64, 0.08)),
+    ):
+        factor = torch.exp((torch.tensor(terms)[:, None] * light[0]).sum(dim=0))
+        lit = dataclasses.replace(dark, light=light).colour_from(torch.tensor([eye]))
+        assert torch.allclose(lit, (dark.rgb * factor).clamp(max=1), atol=1e-5)
+        assert torch.allclose(
+            lit, dataclasses.replace(dark, light=light).colour_from(torch.tensor([eye]) * 3), atol=1e-6
+        )
+        again = (
+            dataclasses.replace(cloud, light=light)
+            .mirrored()
+            .colour_from(torch.tensor([eye]) * torch.tensor([1, 1, -1]))
+        )
+        assert torch.allclose(
+            again, dataclasses.replace(cloud, light=light).colour_from(torch.tensor([eye])), atol=1e-5
+        )
+        baked = bake_cloud(dataclasses.replace(cloud, light=light)).colour_from(np.array(eye, np.float32))
+        assert np.allclose(
+            baked, dataclasses.replace(cloud, light=light).colour_from(torch.tensor([eye]))[0].numpy(), atol=1e-5
+        )

@@ -48,8 +48,10 @@ class MetricSplats:
 def metric_splats(cloud: GaussianCloud, size: Float[Tensor, "3"]) -> MetricSplats:
     """A car's cloud (batch of one) carried from its canonical box: mean A mu + b, covariance A Sigma A^T.
 
-    The box is scaled differently along its axes, so scales and rotations come from an eigenvalue decomposition.
+    The box is scaled differently along its axes, so scales and rotations come from an eigenvalue decomposition. Of the
+    cloud's light only what is alike from everywhere is kept: how bright photos of each side were is left out.
     """
+    usual = 1.0 if cloud.light is None else torch.exp(cloud.light[0, 0])
     linear, shift = gltf_from_canonical(size.double())
     covariance = linear @ cloud.covariance().matrix()[0].double() @ linear.T
     variance, axes = torch.linalg.eigh(covariance)
@@ -59,8 +61,8 @@ def metric_splats(cloud: GaussianCloud, size: Float[Tensor, "3"]) -> MetricSplat
         scale=variance.clamp(min=_LEAST_SCALE_M**2).sqrt().float(),
         quaternion=quaternion_from_rotation(axes).float(),
         opacity=cloud.opacity[0],
-        rgb=cloud.rgb[0],
-        tint=None if cloud.tint is None else cloud.tint[0] @ sight_map(size).float(),
+        rgb=(cloud.rgb[0] * usual).clamp(max=1),
+        tint=None if cloud.tint is None else (cloud.tint[0].mT * usual).mT @ sight_map(size).float(),
     )
 
 

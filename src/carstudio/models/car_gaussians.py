@@ -16,7 +16,7 @@ from carstudio.models.gaussian_template import surface_template
 from carstudio.models.interface import CategoryModel, Latents, PatchBatch
 from carstudio.models.left_views import as_left_views
 from carstudio.models.patch_features import POSE_FEATURES, pose_features, tiny_masked_copy
-from carstudio.rendering.gaussians.cloud import GaussianCloud
+from carstudio.rendering.gaussians.cloud import GaussianCloud, mirrored_light
 from carstudio.rendering.gaussians.tiles import TILE_PX
 from carstudio.rendering.gaussians.tracing import SplattingConfig, render_cloud, trace_cloud
 from carstudio.rendering.rays import Rays, to_canonical
@@ -48,6 +48,10 @@ class CarGaussiansConfig:
     encodes_left_views: bool = False
     """Photos of right sides are encoded as the left views that they are in a mirror, and colours change sides after
     decoding; a number at the end of the texture code tells the side (1 left, -1 right, between them a mixture)."""
+    starts_from_brightness: bool = False
+    """Colours start from the mean brightness of the car in the photo, whose logit is a number of the texture code."""
+    has_light: bool = False
+    """The codes tell how bright the car is from each side, exposure and all (`GaussianCloud.light`)."""
     colour_skip_px: int = 8
     """Side of a tiny copy of the masked crop, added to the texture code by a linear map; 0: none."""
     tint_width: int = 64
@@ -113,15 +117,23 @@ class CarGaussians(CategoryModel):
         shape, texture = self.shape_norm(self.shape_head(features)), self.texture_norm(texture)
         if self.config.encodes_left_views:
             texture = torch.cat([texture, side[:, None].to(texture)], dim=-1)
+        if self.config.starts_from_brightness:
+            texture = torch.cat([texture, brightness_logit(patches)[:, None].to(texture)], dim=-1)
         return Latents(shape, texture)
 
     def decode(self, latents: Latents) -> GaussianCloud:
         """The car's Gaussians in the canonical frame."""
         mean, log_scale, quaternion, opacity = self.geometry(latents.shape)
-        rgb, tint = self.colour(latents)
+        code, *rest = latents.texture.split([self.config.code_size, *self._further_numbers()], dim=-1)
+        level = rest.pop() if self.config.starts_from_brightness else None
+        rgb, tint, light = self.colour(latents.shape, code, level)
         if self.config.encodes_left_views:
-            rgb, tint = exchanged(rgb, tint, latents.texture[:, -1])
-        return GaussianCloud(mean, log_scale, quaternion, opacity, rgb, tint)
+            rgb, tint, light = exchanged(rgb, tint, light, rest.pop()[:, 0])
+        return GaussianCloud(mean, log_scale, quaternion, opacity, rgb, tint, light)
+
+    def _further_numbers(self) -> list[int]:
+        """Lengths of what follows the texture code proper: the side, the brightness."""
+        return [1] * (self.config.encodes_left_views + self.config.starts_from_brightness)
 
     def trace_levels(
         self, rays: Rays, latents: Latents, box: Box3D, generator: torch.Generator | None = None
@@ -140,10 +152,18 @@ class CarGaussians(CategoryModel):
             return (render_cloud(cloud, rays, to_canonical(rays, box), self.config.splatting),)
 
 
+Colours = tuple[
+    Float[Tensor, "batch splat 3"], Float[Tensor, "batch splat 3 3"] | None, Float[Tensor, "batch 9 3"] | None
+]
+
+
 def exchanged(
-    rgb: Float[Tensor, "batch splat 3"], tint: Float[Tensor, "batch splat 3 3"] | None, side: Float[Tensor, " batch"]
-) -> tuple[Float[Tensor, "batch splat 3"], Float[Tensor, "batch splat 3 3"] | None]:
-    """Colours as they are for side 1, those of the mirror twins for side -1, mixed in between.
+    rgb: Float[Tensor, "batch splat 3"],
+    tint: Float[Tensor, "batch splat 3 3"] | None,
+    light: Float[Tensor, "batch 9 3"] | None,
+    side: Float[Tensor, " batch"],
+) -> Colours:
+    """Colours, tint and light as they are for side 1, those of the mirror twins for side -1, mixed in between.
 
     A Gaussian's twin stands half the number of Gaussians further on; its tint sees a line of sight mirrored in z.
     """
@@ -152,7 +172,17 @@ def exchanged(
     if tint is not None:
         twins = tint.roll(half, dims=1) * tint.new_tensor([1.0, 1.0, -1.0])
         tint = share[..., None] * tint + (1 - share[..., None]) * twins
-    return rgb, tint
+    if light is not None:
+        light = share * light + (1 - share) * mirrored_light(light)
+    return rgb, tint, light
+
+
+def brightness_logit(patches: PatchBatch) -> Float[Tensor, " batch"]:
+    """Logit of the mean of the car's pixels over all channels, that of 1/2 where the mask is empty."""
+    mask = patches.mask[:, None]
+    count = 3 * mask.sum(dim=(1, 2, 3))
+    mean = torch.where(count > 0, (patches.image * mask).sum(dim=(1, 2, 3)) / count.clamp(min=1), 0.5)
+    return torch.logit(mean.clamp(0.02, 0.98))
 
 
 def _exact(latents: Latents, rays: Rays) -> Latents:
@@ -228,7 +258,7 @@ class GeometryDecoder(nn.Module):
 
 
 class ColourDecoder(nn.Module):
-    """Texture code (and the detached shape code) to a colour per Gaussian."""
+    """Texture code (and the detached shape code) to a colour per Gaussian, and to the light."""
 
     def __init__(self, config: CarGaussiansConfig) -> None:
         super().__init__()
@@ -240,13 +270,24 @@ class ColourDecoder(nn.Module):
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
             self.tint = nn.Sequential(nn.Linear(config.width, config.tint_width), last)
+        if config.has_light:
+            self.light = nn.Linear(config.width, 27)
+            nn.init.zeros_(self.light.weight)
+            nn.init.zeros_(self.light.bias)
 
     def forward(
-        self, latents: Latents
-    ) -> tuple[Float[Tensor, "batch splat 3"], Float[Tensor, "batch splat 3 3"] | None]:
-        """Colours in [0, 1], and their change with the line of sight where the config asks for one."""
-        texture = latents.texture[:, : self.config.code_size]
-        hidden = self.hidden(torch.cat([texture, latents.shape.detach()], dim=-1))
-        colours = torch.sigmoid(self.colours(hidden).unflatten(-1, (-1, 3)))
+        self,
+        shape: Float[Tensor, "batch code"],
+        texture: Float[Tensor, "batch code"],
+        level: Float[Tensor, "batch 1"] | None,
+    ) -> Colours:
+        """Colours in [0, 1], their change with the line of sight and the light where the config asks for them.
+
+        `level` is added to the logits of all colours.
+        """
+        hidden = self.hidden(torch.cat([texture, shape.detach()], dim=-1))
+        logits = self.colours(hidden)
+        colours = torch.sigmoid(logits if level is None else logits + level).unflatten(-1, (-1, 3))
         tint = self.tint(hidden).unflatten(-1, (-1, 3, 3)) if self.config.tint_width else None
-        return colours, tint
+        light = self.light(hidden).unflatten(-1, (9, 3)) if self.config.has_light else None
+        return colours, tint, light

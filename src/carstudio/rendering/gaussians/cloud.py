@@ -4,12 +4,16 @@ Notation: mu mean, s scales, R rotation, Sigma = R diag(s^2) R^T covariance, P =
 """
 
 from dataclasses import dataclass
+from typing import TypeVar
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from carstudio.rendering.gaussians.symmetric import Planes, Symmetric3, dot, planes, planes3
+
+Numbers = TypeVar("Numbers", Tensor, np.ndarray)
 
 
 @dataclass(frozen=True)
@@ -23,13 +27,21 @@ class GaussianCloud:
     rgb: Float[Tensor, "batch splat 3"]
     tint: Float[Tensor, "batch splat 3 3"] | None = None
     """Change of each channel with the line of sight (canonical unit vector), degree 1; or none."""
+    light: Float[Tensor, "batch 9 3"] | None = None
+    """Logarithm of a factor per channel on all colours, by `light_terms` of the direction to the camera; or none."""
 
     def colour_from(self, eye: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch splat 3"]:
-        """What a camera there (canonical) sees: rgb, tinted by the direction from which each Gaussian is seen."""
-        if self.tint is None:
-            return self.rgb
-        sight = torch.nn.functional.normalize(self.mean.detach() - eye[:, None], dim=-1)
-        return (self.rgb + (self.tint @ sight[..., None]).squeeze(-1)).clamp(0, 1)
+        """What a camera there (canonical) sees: rgb, tinted by the direction from which each Gaussian is seen, all
+        brighter or darker by where the camera is.
+        """
+        colour = self.rgb
+        if self.tint is not None:
+            sight = torch.nn.functional.normalize(self.mean.detach() - eye[:, None], dim=-1)
+            colour = (colour + (self.tint @ sight[..., None]).squeeze(-1)).clamp(0, 1)
+        if self.light is not None:
+            terms = torch.stack(light_terms(*torch.nn.functional.normalize(eye, dim=-1).unbind(-1)), dim=-1)
+            colour = (colour * torch.exp(terms[:, None] @ self.light)).clamp(max=1)
+        return colour
 
     def covariance(self) -> Symmetric3:
         """R diag(s^2) R^T."""
@@ -52,7 +64,18 @@ class GaussianCloud:
             self.opacity,
             self.rgb,
             None if self.tint is None else self.tint * self.mean.new_tensor([1.0, 1.0, -1.0]),
+            None if self.light is None else mirrored_light(self.light),
         )
+
+
+def light_terms(x: Numbers, y: Numbers, z: Numbers) -> tuple[Numbers, ...]:
+    """The nine spherical harmonics up to degree 2 of unit vectors, up to factors; all but the first have mean 0."""
+    return (x**0, x, y, z, x * y, x * z, y * z, x * x - z * z, 3 * y * y - 1)
+
+
+def mirrored_light(light: Float[Tensor, "batch 9 3"]) -> Float[Tensor, "batch 9 3"]:
+    """The same for directions with z negated."""
+    return light * light.new_tensor([1, 1, 1, -1, 1, -1, -1, 1, 1])[:, None]
 
 
 @dataclass(frozen=True)

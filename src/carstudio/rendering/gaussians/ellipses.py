@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from carstudio.rendering.gaussians.cloud import GaussianCloud
+from carstudio.rendering.gaussians.cloud import GaussianCloud, light_terms
 from carstudio.rendering.gaussians.reference import FAINTEST, MAX_ALPHA
 
 _PIXEL_VARIANCE = 1 / 12  # px^2, of a pixel's square along each axis; what `rays.pixel_rays` makes of it
@@ -26,14 +26,19 @@ class BakedCloud:
     opacity: Float[np.ndarray, " splat"]
     rgb: Float[np.ndarray, "splat 3"]
     tint: Float[np.ndarray, "splat 3 3"] | None
+    light: Float[np.ndarray, "9 3"] | None
 
     def colour_from(self, eye: Float[np.ndarray, "3"]) -> Float[np.ndarray, "splat 3"]:
         """As `GaussianCloud.colour_from`."""
-        if self.tint is None:
-            return self.rgb
-        sight = self.mean - eye
-        sight /= np.sqrt((sight * sight).sum(axis=-1, keepdims=True))
-        return np.clip(self.rgb + (self.tint @ sight[..., None])[..., 0], 0, 1)
+        colour = self.rgb
+        if self.tint is not None:
+            sight = self.mean - eye
+            sight /= np.sqrt((sight * sight).sum(axis=-1, keepdims=True))
+            colour = np.clip(colour + (self.tint @ sight[..., None])[..., 0], 0, 1)
+        if self.light is not None:
+            x, y, z = (eye / np.sqrt((eye * eye).sum()))[:, None]
+            colour = np.minimum(colour * np.exp(np.stack(light_terms(x, y, z), axis=-1) @ self.light), 1)
+        return colour
 
 
 @dataclass(frozen=True)
@@ -51,7 +56,7 @@ class Ellipses:
 
 def bake_cloud(cloud: GaussianCloud) -> BakedCloud:
     """The first car of a batch: on the CPU, in single precision, without gradients."""
-    parts = cloud.mean, cloud.covariance().matrix(), cloud.opacity, cloud.rgb, cloud.tint
+    parts = cloud.mean, cloud.covariance().matrix(), cloud.opacity, cloud.rgb, cloud.tint, cloud.light
     arrays = [None if part is None else part[0].detach().float().cpu().numpy() for part in parts]
     return BakedCloud(*arrays)  # type: ignore[arg-type]
 
