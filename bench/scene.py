@@ -20,6 +20,7 @@ from carstudio.allocator import keep_freed_memory
 from carstudio.fitting.car_file import Car
 from carstudio.geometry.transforms import quaternion_from_rotation, rotation_y
 from carstudio.images import encode_png
+from carstudio.models.car_gaussians import CarGaussiansConfig
 from carstudio.models.interface import Latents
 from carstudio.scene.drawing import draw_frame
 from carstudio.scene.frame_jobs import PRESETS, frame_job
@@ -40,12 +41,15 @@ def made_up_scene(folder: Path, frames: int) -> Scene:
     """A log of noise with five cars, each driving 0.5 m per frame."""
     shelf, random = CarShelf(folder / "scene"), torch.Generator().manual_seed(0)
     described = describe_model(bundled_models()["car-gaussians"])
-    sha256, code_size = described.sha256, described.config.code_size  # type: ignore[union-attr]
+    assert isinstance(described.config, CarGaussiansConfig)
+    sizes = (described.config.code_size, described.config.texture_size)
     size, turn = (4.2, 1.5, 1.8), quaternion_from_rotation(rotation_y(torch.tensor(-1.5, dtype=torch.float64)))
     tracks = {}
     for i, (x, z) in enumerate(PLACES):
-        codes = Latents(*torch.randn(2, 1, code_size, generator=random))
-        car = Car(codes, size, "car-gaussians", sha256, f"car-{i}", "CC0-1.0", provenance={"scene_key": "bench"})
+        codes = Latents(*(torch.randn(1, size, generator=random) for size in sizes))
+        car = Car(
+            codes, size, "car-gaussians", described.sha256, f"car-{i}", "CC0-1.0", provenance={"scene_key": "bench"}
+        )
         boxes = {k: PlacedBox((x, 0.9, z + 0.5 * k), size, tuple(turn.tolist())) for k in range(frames)}
         tracks[str(i)] = Track(track_id=str(i), boxes=boxes, car=shelf.add(car, f"car-{i}"))
     return Scene(root=str(folder), source="bench", licence="CC0-1.0", frames=_photos(folder, frames), tracks=tracks)

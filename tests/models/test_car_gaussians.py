@@ -294,7 +294,7 @@ def test_a_mirrored_photo_gives_the_mirrored_car() -> None:
     model, patches = moved_model(), batch(6)
     own, other = model.encode(patches), model.encode(mirrored(patches))
     assert torch.allclose(own.shape, other.shape, atol=1e-6)
-    assert own.texture.shape == (6, SMALL.code_size + 2)
+    assert own.texture.shape == (6, LEFT.texture_size) == (6, SMALL.code_size + 2)
     same, side = [*range(SMALL.code_size), SMALL.code_size + 1], SMALL.code_size
     assert torch.allclose(own.texture[:, same], other.texture[:, same], atol=1e-6)
     assert torch.equal(own.texture[:, side], -other.texture[:, side])

@@ -38,7 +38,7 @@ class CarGaussiansConfig:
     num_splats: int = 512
     """Gaussians of a car."""
     code_size: int = 128
-    """Length of each of the two codes."""
+    """Length of each of the two codes (`texture_size`: with what else a texture code tells)."""
     width: int = 256
     """Hidden width of the two decoders."""
     blocks: int = 0
@@ -66,6 +66,11 @@ class CarGaussiansConfig:
         assert not self.is_symmetric or self.num_splats % 2 == 0, "mirrored pairs need an even number of Gaussians"
         assert self.is_symmetric or not self.encodes_left_views, "only mirrored pairs can exchange their colours"
         assert 0 < self.least_scale < self.largest_scale, "scales are positive, the least below the largest"
+
+    @property
+    def texture_size(self) -> int:
+        """Numbers of a texture code: the code proper, then the side and the brightness where they are told."""
+        return self.code_size + self.encodes_left_views + self.starts_from_brightness
 
 
 class CarGaussians(CategoryModel):
