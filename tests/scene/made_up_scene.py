@@ -66,7 +66,7 @@ def made_up_car(seed: int, size: tuple[float, float, float] = SIZE) -> Car:
     """A car of the bundled model whose codes are drawn by chance."""
     generator = torch.Generator().manual_seed(seed)
     return Car(
-        latents=drawn_latents(describe_model("car-gaussians").config, generator),
+        latents=drawn_latents(generator),
         size=size,
         model_name="car-gaussians",
         model_sha256=describe_model("car-gaussians").sha256,
