@@ -260,6 +260,14 @@ def mirrored(patches: PatchBatch) -> PatchBatch:
     )
 
 
+def aside(count: int) -> PatchBatch:
+    """Photos of cars beside the middle, by a camera whose principal point is beside it too."""
+    patches = batch(count)
+    box = dataclasses.replace(patches.box, center=patches.box.center + torch.tensor([0.6, 0.1, 0.0]))
+    intrinsics = patches.camera.intrinsics + torch.tensor([0.0, 0.0, 1.5, 0.0])
+    return dataclasses.replace(patches, box=box, camera=dataclasses.replace(patches.camera, intrinsics=intrinsics))
+
+
 def moved_model() -> CarGaussians:
     """One whose colours are tinted and whose Gaussians depend on the photo, unlike before the first step."""
     torch.manual_seed(1)
@@ -272,7 +280,7 @@ def moved_model() -> CarGaussians:
 
 
 def test_left_views_are_the_photos_of_the_left_and_the_mirror_images_of_the_others() -> None:
-    patches = batch(6)  # azimuths 10 to 260 degrees
+    patches = aside(6)  # azimuths 10 to 260 degrees
     turned, side = as_left_views(patches)
     eye = canonical_from_camera(patches.box)[:, 2, 3]
     assert side.tolist() == eye.sign().tolist()
@@ -291,7 +299,7 @@ def test_left_views_are_the_photos_of_the_left_and_the_mirror_images_of_the_othe
 @torch.no_grad()
 def test_a_mirrored_photo_gives_the_mirrored_car() -> None:
     """Codes are the same but for the side, and pictures are each other's mirror images, tint and all."""
-    model, patches = moved_model(), batch(6)
+    model, patches = moved_model(), aside(6)
     own, other = model.encode(patches), model.encode(mirrored(patches))
     assert torch.allclose(own.shape, other.shape, atol=1e-6)
     assert own.texture.shape == (6, LEFT.texture_size) == (6, SMALL.code_size + 2)
