@@ -331,6 +331,10 @@ def test_between_the_sides_colours_are_mixed() -> None:
     assert torch.equal(right[0][:, :4], rgb[:, 4:])
     assert torch.equal(right[1][:, 4:], tint[:, :4] * torch.tensor([1.0, 1.0, -1.0]))
     assert torch.allclose(middle[0], (left[0] + right[0]) / 2)
+    beyond = exchanged(
+        torch.tensor([[[0.0, 0.5, 1.0]], [[1.0, 0.5, 0.0]]]).transpose(0, 1), None, None, torch.ones(1) * 3
+    )
+    assert beyond[0].tolist() == [[[0.0, 0.5, 1.0], [1.0, 0.5, 0.0]]]
     assert left[2] is not None
     assert torch.equal(left[2], light)
     assert exchanged(rgb, None, None, torch.ones(1))[1:] == (None, None)

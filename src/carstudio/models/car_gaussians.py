@@ -129,16 +129,13 @@ class CarGaussians(CategoryModel):
     def decode(self, latents: Latents) -> GaussianCloud:
         """The car's Gaussians in the canonical frame."""
         mean, log_scale, quaternion, opacity = self.geometry(latents.shape)
-        code, *rest = latents.texture.split([self.config.code_size, *self._further_numbers()], dim=-1)
+        further = [1] * (self.config.texture_size - self.config.code_size)
+        code, *rest = latents.texture.split([self.config.code_size, *further], dim=-1)
         level = rest.pop() if self.config.starts_from_brightness else None
         rgb, tint, light = self.colour(latents.shape, code, level)
         if self.config.encodes_left_views:
             rgb, tint, light = exchanged(rgb, tint, light, rest.pop()[:, 0])
         return GaussianCloud(mean, log_scale, quaternion, opacity, rgb, tint, light)
-
-    def _further_numbers(self) -> list[int]:
-        """Lengths of what follows the texture code proper: the side, the brightness."""
-        return [1] * (self.config.encodes_left_views + self.config.starts_from_brightness)
 
     def trace_levels(
         self, rays: Rays, latents: Latents, box: Box3D, generator: torch.Generator | None = None
@@ -170,10 +167,11 @@ def exchanged(
 ) -> Colours:
     """Colours, tint and light as they are for side 1, those of the mirror twins for side -1, mixed in between.
 
-    A Gaussian's twin stands half the number of Gaussians further on; its tint sees a line of sight mirrored in z.
+    A Gaussian's twin stands half the number of Gaussians further on; its tint sees a line of sight mirrored in z. A fit
+    may move the side a little beyond: colours stay in [0, 1].
     """
     share, half = ((1 + side) / 2)[:, None, None], rgb.shape[1] // 2
-    rgb = share * rgb + (1 - share) * rgb.roll(half, dims=1)
+    rgb = (share * rgb + (1 - share) * rgb.roll(half, dims=1)).clamp(0, 1)
     if tint is not None:
         twins = tint.roll(half, dims=1) * tint.new_tensor([1.0, 1.0, -1.0])
         tint = share[..., None] * tint + (1 - share[..., None]) * twins

@@ -31,11 +31,9 @@ class Symmetric3:
         rows = [self.xx, self.xy, self.xz, self.xy, self.yy, self.yz, self.xz, self.yz, self.zz]
         return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 
-    def __add__(self, other: "Symmetric3") -> "Symmetric3":
-        return Symmetric3(*(mine + theirs for mine, theirs in zip(self._entries(), other._entries(), strict=True)))
-
     def __mul__(self, factor: Tensor | float) -> "Symmetric3":
-        return Symmetric3(*(entry * factor for entry in self._entries()))
+        entries = (self.xx, self.xy, self.xz, self.yy, self.yz, self.zz)
+        return Symmetric3(*(entry * factor for entry in entries))
 
     def plus_diagonal(self, x: Tensor, y: Tensor, z: Tensor) -> "Symmetric3":
         """M + diag(x, y, z)."""
@@ -73,9 +71,6 @@ class Symmetric3:
     def quadratic(self, vector: Planes) -> Tensor:
         """v^T M v."""
         return dot(self.times(vector), vector)
-
-    def _entries(self) -> tuple[Tensor, ...]:
-        return (self.xx, self.xy, self.xz, self.yy, self.yz, self.zz)
 
 
 def planes(vectors: Float[Tensor, "*batch n"]) -> tuple[Tensor, ...]:
