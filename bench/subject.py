@@ -64,7 +64,8 @@ class Subject:
 
     def render_view(self) -> None:
         """One view of the first car, decoding its latents included, encoding its photo not."""
-        self.model.eval()
+        if self.model.training:  # asked first: telling every module takes a twentieth of a view
+            self.model.eval()
         render_image(self.model, orbit_camera(self.size_px).to(self.device), self.latents, self.first_box())
 
     def first_box(self) -> Box3D:

@@ -1,5 +1,7 @@
 """Baked cars against the model's own pictures, on the bundled weights; what cannot be drawn that way."""
 
+from copy import deepcopy
+from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -13,7 +15,9 @@ from carstudio.fitting.car_file import load_car
 from carstudio.geometry.box3d import Box3D
 from carstudio.geometry.camera import Camera
 from carstudio.geometry.orbit import orbit_box, orbit_camera
+from carstudio.models.car_gaussians import CarGaussiansConfig
 from carstudio.models.interface import CategoryModel, Latents, render_image, window_of
+from carstudio.rendering.gaussians.tracing import SplattingConfig
 from carstudio.report.panels import encode_patch
 from models.codes import mean_latents
 from training.toy import toy_store
@@ -68,6 +72,35 @@ def test_a_baked_car_looks_like_the_model_s_own_pictures() -> None:
     assert all(right > wrong + 1 for right, wrong in zip(found, beside, strict=True)), (found, beside)
     assert float(torch.cat(depth_m).median()) < 0.01
     assert float(torch.cat(depth_m).quantile(0.95)) < 0.05
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", ["sedan-white", "suv-red", "hatchback-grey"])
+def test_a_whole_picture_is_what_its_rays_give(name: str) -> None:
+    """Drawn at once (a chunk makes it go ray by ray); the two part where an alpha is at the edge of what counts.
+
+    All hits count, or those two that stand 32nd and 33rd at one depth could change places.
+    """
+    model, camera = deepcopy(bundled("car-gaussians")), orbit_camera(128)
+    assert isinstance(model.config, CarGaussiansConfig)
+    model.config = replace(model.config, splatting=SplattingConfig(most=128))
+    latents, size = bundled_car(name)
+    for azimuth_deg in (20.0, 100.0, 200.0, 290.0):
+        box = placed(size, azimuth_deg)
+        fast, slow = (render_image(model, camera, latents, box, chunk=chunk) for chunk in (None, 4096))
+        assert crop_psnr(fast["rgb"], slow["rgb"], box, camera) > 80
+        assert float((fast["opacity"] - slow["opacity"]).abs().max()) < 5e-3
+        assert bool(((fast["opacity"] > 0.01) == (slow["opacity"] > 0.01)).all())
+        solid = slow["opacity"] > 0.5
+        assert float((fast["depth_m"] - slow["depth_m"])[solid].abs().max()) < 0.01
+
+
+def test_what_cannot_be_drawn_at_once_goes_ray_by_ray() -> None:
+    model, (latents, size) = bundled("car-gaussians"), bundled_car("suv-red")
+    camera, box = orbit_camera(32), placed(size, 30.0)
+    assert model.draw(camera, latents, box) is not None
+    assert model.draw(camera, latents, placed(size, 30.0, distance_m=2.2)) is None
+    assert model.draw(Camera(camera.intrinsics.double(), 32, 32), latents, box) is None
 
 
 @torch.no_grad()

@@ -22,7 +22,7 @@ from carstudio.models.interface import CategoryModel, Latents, PatchBatch, rende
 from carstudio.models.left_views import as_left_views
 from carstudio.models.zoo import config_from_json, config_to_json
 from carstudio.recipes import RECIPES, recipe
-from carstudio.rendering.gaussians.ellipses import bake_cloud
+from carstudio.rendering.gaussians.projection import bake_cloud
 from carstudio.rendering.rays import image_rays, to_canonical
 from carstudio.rendering.volume import composite
 from carstudio.training.checkpoint import load_model, save_model

@@ -8,9 +8,10 @@ import torch
 
 from carstudio.geometry.box3d import Box3D
 from carstudio.geometry.camera import Camera
-from carstudio.rendering.gaussians import screen
+from carstudio.rendering.gaussians import screen_tiles
 from carstudio.rendering.gaussians.cloud import GaussianCloud
-from carstudio.rendering.gaussians.ellipses import Ellipses, bake_cloud, ellipses_of
+from carstudio.rendering.gaussians.ellipses import Ellipses, ellipses_of
+from carstudio.rendering.gaussians.projection import bake_cloud, project
 from carstudio.rendering.gaussians.reference import responses
 from carstudio.rendering.gaussians.screen import draw_ellipses
 from carstudio.rendering.gaussians.tracing import SplattingConfig, render_cloud, splats_seen
@@ -22,9 +23,7 @@ FAR = Camera(torch.tensor([4200.0, 3900.0, 25.3, 21.8]), FAR_SIDE, FAR_SIDE)  # 
 
 
 def ellipses(cloud: GaussianCloud, camera: Camera, box: Box3D) -> Ellipses:
-    center, size, rotation = (part[0].float().numpy() for part in (box.center, box.size, box.rotation))
-    baked = bake_cloud(cloud)
-    return ellipses_of(baked, tuple(camera.intrinsics.tolist()), center=center, size=size, rotation=rotation)
+    return ellipses_of(project(bake_cloud(cloud), camera, box))
 
 
 def few(count: int) -> GaussianCloud:
@@ -85,8 +84,8 @@ def test_bands_and_chunks_change_no_pixel(monkeypatch: pytest.MonkeyPatch) -> No
     assert whole.shape == (101, 137, 5)
     assert float(whole[..., 3].max()) > 0.9
     for band, chunk in ((40, 2**17), (1, 1), (4096, 2**12)):
-        monkeypatch.setattr(screen, "_BAND", band)
-        monkeypatch.setattr(screen, "_CHUNK", chunk)
+        monkeypatch.setattr(screen_tiles, "_BAND", band)
+        monkeypatch.setattr(screen_tiles, "_CHUNK", chunk)
         parts = draw_ellipses(found, 137, 101)
         assert np.abs(parts - whole)[..., :4].mean() < 1e-5  # depths are told apart within a band's own range
         assert (np.abs(parts - whole)[..., :4].max(axis=-1) > 1e-3).mean() < 1e-3

@@ -15,7 +15,8 @@ from carstudio.geometry.camera import Camera
 from carstudio.models.car_gaussians import CarGaussians
 from carstudio.models.interface import NEAR_M, CategoryModel, Latents, render_image
 from carstudio.rendering.gaussians.cloud import GaussianCloud
-from carstudio.rendering.gaussians.ellipses import BakedCloud, bake_cloud, ellipses_of
+from carstudio.rendering.gaussians.ellipses import ellipses_of
+from carstudio.rendering.gaussians.projection import BakedCloud, bake_cloud, project
 from carstudio.rendering.gaussians.screen import draw_ellipses
 from carstudio.rendering.gaussians.tiles import TILE_PX
 from carstudio.rendering.gaussians.tracing import SplattingConfig, render_cloud
@@ -41,11 +42,7 @@ class BakedCar:
         camera, box = camera.to("cpu"), box.to("cpu")
         if bool((box.corners()[0, :, 2] < NEAR_M).any()):
             return render_image(_Traced(self), camera, Latents(torch.zeros(1, 0), torch.zeros(1, 0)), box)
-        fx, fy, cx, cy = camera.intrinsics.tolist()
-        center, size, rotation = (part[0].float().numpy() for part in (box.center, box.size, box.rotation))
-        ellipses = ellipses_of(
-            self.arrays, (fx, fy, cx, cy), center=center, size=size, rotation=rotation, widen=self.splatting.widen
-        )
+        ellipses = ellipses_of(project(self.arrays, camera, box, widen=self.splatting.widen))
         image = torch.from_numpy(draw_ellipses(ellipses, camera.width, camera.height))
         return {"rgb": image[..., :3], "opacity": image[..., 3], "depth_m": image[..., 4]}
 

@@ -11,12 +11,15 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from carstudio.geometry.box3d import Box3D
+from carstudio.geometry.camera import Camera
 from carstudio.models.encoders import EncoderConfig, build_encoder, load_imagenet
 from carstudio.models.gaussian_template import surface_template
 from carstudio.models.interface import CategoryModel, Latents, PatchBatch
 from carstudio.models.left_views import as_left_views
 from carstudio.models.patch_features import POSE_FEATURES, pose_features, tiny_masked_copy
 from carstudio.rendering.gaussians.cloud import GaussianCloud, mirrored_light
+from carstudio.rendering.gaussians.pinhole import draw_exactly
+from carstudio.rendering.gaussians.projection import bake_cloud, project
 from carstudio.rendering.gaussians.tiles import TILE_PX
 from carstudio.rendering.gaussians.tracing import SplattingConfig, render_cloud, trace_cloud
 from carstudio.rendering.rays import Rays, to_canonical
@@ -152,6 +155,18 @@ class CarGaussians(CategoryModel):
         with torch.autocast(rays.directions.device.type, enabled=False):
             cloud = self.decode(_exact(latents, rays))
             return (render_cloud(cloud, rays, to_canonical(rays, box), self.config.splatting),)
+
+    def draw(self, camera: Camera, latents: Latents, box: Box3D) -> Float[Tensor, "height width 5"] | None:
+        """On a CPU, in single precision; see `rendering.gaussians.pinhole`."""
+        like = camera.intrinsics
+        if like.device.type != "cpu" or like.dtype != torch.float32 or self.config.splatting.is_reference:
+            return None
+        with torch.autocast("cpu", enabled=False):
+            cloud = self.decode(Latents(latents.shape.float(), latents.texture.float()))
+        splatting = self.config.splatting
+        seen = project(bake_cloud(cloud), camera, box, widen=splatting.widen)
+        image = draw_exactly(seen, camera.width, camera.height, most=splatting.most)
+        return None if image is None else torch.from_numpy(image)
 
 
 Colours = tuple[
