@@ -204,7 +204,8 @@ def test_a_car_with_colours_of_its_own_is_painted_in_them_too(shelf: CarShelf) -
     old = shelf.load(shelf.ref("car-1"))
     model = shelf.model_of(old)
     own = {name: value.detach().clone() for name, value in model.field_parameters()}
-    own["colour.colours.bias"] = own["colour.colours.bias"] + torch.tensor([1.5, -1.5, -1.5]).repeat(512)
+    colours = own["colour.colours.bias"].view(-1, 3)
+    own["colour.colours.bias"] = (colours + torch.tensor([1.5, -1.5, -1.5])).flatten()
     shelf.add(replace(old, weights=own), "fitted")
     config = QUICK
     ref = recolour_car(shelf, shelf.ref("fitted"), way="paint", colour="#1030c0", config=config)
