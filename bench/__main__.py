@@ -3,8 +3,9 @@
 Training: one step (encode, trace, loss, backward, the recipe's optimiser) of a recipe with its own number of patches
 and rays, or --rays rays of each patch (128 for paper-size recipes: the activations of 3 x 1,024 rays may not fit a
 laptop). Rendering: one view of --size px of a car whose photo has been encoded before.
-Rounds of the recipes are interleaved and medians are given, because shared machines drift; the ratio is to the first
-recipe within the same round. Memory: `bench.memory`, each recipe in processes of its own.
+Rounds of the recipes are interleaved and medians are given, because shared machines drift; what takes less than a
+second is done ten times a round. The ratio is to the first recipe within the same round. Memory: `bench.memory`, each
+recipe in processes of its own.
 """
 
 import argparse
@@ -15,7 +16,7 @@ import statistics
 import torch
 
 from bench.memory import StepMemory, step_memory
-from bench.subject import Subject, measure
+from bench.subject import Subject, steady
 from carstudio.allocator import keep_freed_memory
 from carstudio.devices import pick_device
 from carstudio.recipes import recipe
@@ -45,8 +46,8 @@ def main() -> None:
         subject.encode_first()
     for _ in range(options.rounds):
         for subject in subjects:
-            seconds.setdefault((subject.name, "train"), []).append(measure(subject.train_step, device))
-            seconds.setdefault((subject.name, "render"), []).append(measure(subject.render_view, device))
+            seconds.setdefault((subject.name, "train"), []).append(steady(subject.train_step, device))
+            seconds.setdefault((subject.name, "render"), []).append(steady(subject.render_view, device))
     memory = {subject.name: step_memory(subject.name, subject.rays_per_patch, options.device) for subject in subjects}
     rows = [row(subject, seconds, subjects[0], memory) for subject in subjects]
     print(json.dumps(rows, indent=2) if options.json else table(rows, device, options))
