@@ -159,6 +159,14 @@ def test_there_is_none_where_a_gaussian_reaches_the_camera_s_plane() -> None:
     assert drawn(cloud, WIDE, turned(car_box(), 0.0, [0.0, 0.0, 1.0]), config) is None
 
 
+@pytest.mark.parametrize("name", ["mean", "log_scale", "quaternion", "opacity"])
+def test_numbers_that_are_not_finite_are_no_picture(name: str) -> None:
+    """They are not left out in silence: whoever goes ray by ray then finds them."""
+    cloud = surface_cloud()
+    getattr(cloud, name)[0, 7] = torch.nan
+    assert drawn(cloud, WIDE, car_box(), SplattingConfig()) is None
+
+
 @pytest.mark.parametrize("center", [[60.0, 0.0, 9.0], [0.0, -1e6, 9.0]])
 def test_a_picture_of_nothing_is_empty(center: list[float]) -> None:
     image = drawn(surface_cloud(), WIDE, turned(car_box(), 0.0, center), SplattingConfig())

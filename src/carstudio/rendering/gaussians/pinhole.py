@@ -23,6 +23,7 @@ from carstudio.rendering.gaussians.screen_tiles import (
 _KEY_BITS = 30  # of a sort key: depth above, number below
 _MISSED = np.int32(2**_KEY_BITS)  # keys from here on are no hits
 _FAINTEST_LOG = np.float32(np.log(FAINTEST))
+_NEAREST_M = 0.01  # of a Gaussian's nearest point that counts to the camera's plane
 _NOTHING = -1e4  # a logarithm whose exponential is 0
 
 
@@ -30,10 +31,10 @@ def draw_exactly(seen: Projected, width: int, height: int, *, most: int) -> Floa
     """Premultiplied rgb over black, opacity and depth (m, mean over the weights; 0 where nothing is).
 
     Of each ray's Gaussians the first `most` count. None where a Gaussian, as far as it counts, reaches the camera's
-    plane: its silhouette is no ellipse then.
+    plane (its silhouette is no ellipse then), or where numbers are not finite.
     """
     gaussians = _Seen.of(seen)
-    if not gaussians.near_m > 0:
+    if not (gaussians.near_m > _NEAREST_M and np.isfinite(seen.opacity).all()):
         return None
     return draw_by_bands(width, height, partial(_draw_band, gaussians, most))
 
