@@ -16,7 +16,7 @@ import torch
 import tyro
 
 import carstudio
-from bench.subject import Subject, measure
+from bench.subject import Subject, steady
 from carstudio.allocator import keep_freed_memory
 from carstudio.fitting.car_file import load_car
 from carstudio.geometry.box3d import Box3D
@@ -66,12 +66,11 @@ def likeness(
 
 
 def seconds_of(ways: dict[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
-    """Processor seconds of each way, round by round; quick ones are the median of a few calls."""
+    """Processor seconds of each way in a steady state, round by round."""
     found: dict[str, list[float]] = {way: [] for way in ways}
     for _ in range(rounds):
         for way, draw in ways.items():
-            calls = 1 if way == YARDSTICK else 9
-            found[way].append(statistics.median(measure(draw, torch.device("cpu"))[1] for _ in range(calls)))
+            found[way].append(steady(draw, torch.device("cpu"))[1])
     return found
 
 

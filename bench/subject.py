@@ -74,7 +74,7 @@ class Subject:
         return self.pixels.box.select(slice(0, 1))
 
 
-def measure(action: Callable[[], None], device: torch.device) -> tuple[float, float]:
+def measure(action: Callable[[], object], device: torch.device) -> tuple[float, float]:
     """(wall seconds, processor seconds) of one call, the device's queue drained."""
     wall, processor = time.perf_counter(), time.process_time()
     action()
@@ -83,7 +83,7 @@ def measure(action: Callable[[], None], device: torch.device) -> tuple[float, fl
     return time.perf_counter() - wall, time.process_time() - processor
 
 
-def steady(action: Callable[[], None], device: torch.device) -> tuple[float, float]:
+def steady(action: Callable[[], object], device: torch.device) -> tuple[float, float]:
     """`measure`; of an action that takes less than a second, medians of nine calls after that one.
 
     The first call after another subject finds its weights out of the caches.

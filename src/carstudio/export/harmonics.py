@@ -10,13 +10,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from carstudio.export.mesh import directions
+
 NUM_TERMS = 16  # 1 + 3 + 5 + 7
 SH_CONSTANT = 1 / (2 * math.sqrt(math.pi))  # Y_0
 
 
-def harmonics(directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 16"]:
+def harmonics(ways: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 16"]:
     """Y_0 to Y_15 of unit vectors, degree by degree."""
-    x, y, z = directions.unbind(-1)
+    x, y, z = ways.unbind(-1)
     xx, yy, zz = x * x, y * y, z * z
     one, two = math.sqrt(3 / (4 * math.pi)), math.sqrt(15 / (4 * math.pi))
     flat, edge, middle = math.sqrt(35 / (32 * math.pi)), math.sqrt(21 / (32 * math.pi)), math.sqrt(105 / (4 * math.pi))
@@ -33,20 +35,19 @@ def harmonics(directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 16
 
 
 def directions_around(count: int) -> Float[Tensor, "count 3"]:
-    """Unit vectors spread evenly over the sphere (a Fibonacci spiral about y), double precision."""
-    height = 1 - (2 * torch.arange(count, dtype=torch.float64) + 1) / count
-    angle = torch.arange(count, dtype=torch.float64) * math.pi * (3 - math.sqrt(5))
-    across = (1 - height**2).sqrt()
-    return torch.stack([across * angle.cos(), height, across * angle.sin()], dim=-1)
+    """Unit vectors spread evenly over the sphere (`directions` about y), double precision."""
+    azimuth, elevation = torch.tensor(directions(count, lowest_deg=-90.0), dtype=torch.float64).deg2rad().unbind(-1)
+    across = elevation.cos()
+    return torch.stack([across * azimuth.cos(), elevation.sin(), across * azimuth.sin()], dim=-1)
 
 
 def fitted(
-    directions: Float[Tensor, "way splat 3"],
+    ways: Float[Tensor, "way splat 3"],
     weights: Float[Tensor, " way"],
     values: Float[Tensor, "way splat channel"],
 ) -> Float[Tensor, "splat channel 16"]:
     """Coefficients whose sum comes nearest to each splat's values by least squares, each way as its weight says."""
-    terms = harmonics(directions)
+    terms = harmonics(ways)
     weighted = terms * weights[:, None, None]
     products = torch.einsum("wsi,wsj->sij", weighted, terms)
     return torch.linalg.solve(products, torch.einsum("wsi,wsc->sic", weighted, values)).mT

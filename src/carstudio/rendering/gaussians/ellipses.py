@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from carstudio.rendering.gaussians.projection import Projected
-from carstudio.rendering.gaussians.reference import FAINTEST, MAX_ALPHA
+from carstudio.rendering.gaussians.reference import MAX_ALPHA
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ def ellipses_of(seen: Projected) -> Ellipses:
     """The ellipses of a projected cloud."""
     uu, uv, vv = seen.uu, seen.uv, seen.vv
     opacity = np.minimum(seen.opacity, MAX_ALPHA)
-    limit = 2 * np.log(np.maximum(opacity / FAINTEST, 1e-12))
+    limit = seen.limit
     spread = np.sqrt(np.maximum(limit, 0) / np.maximum(uu * vv - uv * uv, 1e-20))
     table = np.stack(
         [

@@ -15,6 +15,7 @@ from carstudio.rendering.gaussians.reference import FAINTEST, MAX_ALPHA
 from carstudio.rendering.gaussians.screen_tiles import (
     MONOMIALS,
     PIXELS,
+    composite_in_place,
     draw_by_bands,
     fullest_first,
     pairs_met,
@@ -156,10 +157,7 @@ def _composite(
     place = (keys & np.int32((1 << bits) - 1)) + np.arange(0, alpha.size, ranks, dtype=np.int32)
     place = place.astype(np.intp)
     weights = alpha.take(place)
-    passing = np.ones_like(weights[0])
-    for weight in weights:
-        weight *= passing
-        passing -= weight
+    composite_in_place(weights)
     spread = np.zeros(alpha.size, np.float32)
     spread[place] = weights
     sums = np.matmul(spread.reshape(PIXELS, tiles, ranks).swapaxes(0, 1), channels)

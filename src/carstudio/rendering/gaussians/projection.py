@@ -1,4 +1,4 @@
-"""Gaussians as the rays of a pinhole camera meet them, in pixels; in NumPy, since arrays of 512 are all overhead.
+"""Gaussians as the rays of a pinhole camera meet them, in pixels; in NumPy: arrays of a thousand are all overhead.
 
 In the camera frame a Gaussian has mean z d with d = (x, y, 1), covariance S, and S has the cofactors C. A ray along
 d + a, a = (dx, dy, 0), passes it at the squared distance z^2 (a x d)^T S (a x d) / ((d + a)^T C (d + a)) and comes

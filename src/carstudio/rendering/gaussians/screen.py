@@ -16,6 +16,7 @@ from carstudio.rendering.gaussians.screen_tiles import (
     PIXELS,
     U,
     V,
+    composite_in_place,
     draw_by_bands,
     fullest_first,
     pairs_met,
@@ -47,10 +48,7 @@ def _weights(
     weights = terms.take(place.ravel(), axis=0) @ MONOMIALS
     np.exp(weights, out=weights)
     weights = weights.reshape(*place.shape, PIXELS)
-    passing = np.ones(weights.shape[1:], dtype=np.float32)
-    for weight in weights:
-        weight *= passing
-        passing -= weight
+    composite_in_place(weights)
     return weights
 
 

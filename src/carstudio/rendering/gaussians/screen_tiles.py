@@ -84,6 +84,14 @@ def fullest_first(
         done += len(some)
 
 
+def composite_in_place(alpha: np.ndarray) -> None:
+    """Alphas (rank, ...), front first, to weights alpha_i prod_{j<i} (1 - alpha_j)."""
+    passing = np.ones_like(alpha[0])
+    for weight in alpha:
+        weight *= passing
+        passing -= weight
+
+
 def _within_rectangles(
     table: Float[np.ndarray, "8 splat"], first_row: int, columns: int, rows: int
 ) -> tuple[Int[np.ndarray, " pair"], Int[np.ndarray, " pair"], Int[np.ndarray, " pair"]]:
