@@ -21,7 +21,7 @@ def composite_hits(
 ) -> tuple[Float[Tensor, "batch ray 3"], Float[Tensor, "batch ray 2"], Float[Tensor, "batch ray hit"]]:
     """Colour over black; opacity and weighted sum of t; the weights (without gradient).
 
-    Each Gaussian occurs once in a ray's `index`.
+    Each Gaussian occurs once in a ray's `index`, but for places of alpha 0.
     """
     colour, sums, weights = _CompositeHits.apply(alpha, t, index, rgb)
     return colour, sums, weights
@@ -69,4 +69,4 @@ def _rows(alpha: Tensor, num_splats: int) -> list[slice]:
 def _spread(values: Tensor, index: Tensor, num_splats: int) -> Tensor:
     """(batch, ray, splat) of hits' values, 0 elsewhere."""
     dense = torch.zeros(*values.shape[:2], num_splats, dtype=values.dtype, device=values.device)
-    return dense.scatter_(-1, index, values)
+    return dense.scatter_add_(-1, index, values)

@@ -5,12 +5,14 @@ with features of the ray's point x and direction d: c = a^T P a with (x x, -2 x,
 The point x lies near the car, never at the camera: c - b^2 / e would cancel away there in float32.
 """
 
+import math
 from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn.functional import pad
 
 from carstudio.rendering.gaussians.cloud import Splats
 from carstudio.rendering.gaussians.reference import FAINTEST, MAX_ALPHA
@@ -30,7 +32,7 @@ def ray_hits(
 ) -> tuple[Float[Tensor, "batch ray hit"], Float[Tensor, "batch ray hit"], Int[Tensor, "batch ray hit"]]:
     """The first `most` Gaussians along each ray x + t d whose alpha is worth showing, from front to back.
 
-    Gives alpha (0 where there are fewer), t of the peak and the Gaussian's number. `directions` are unit vectors and
+    Gives alpha, t of the peak and the Gaussian's number; alpha and number are 0 where there are fewer. `directions` are unit vectors and
     `points` within two units of the origin. Peaks at t <= `nearest` (the camera) count as missed. Gradients flow
     through alpha and t, in closed form, to the splats and, where they are asked for, to points and directions.
     """
@@ -86,21 +88,21 @@ class _Hits(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor]:
         batch, num_rays, num_splats = features.shape[0], features.shape[1], opacity.shape[-1]
         most = min(most, num_splats)
-        alpha, t = (features.new_empty(batch, num_rays, most) for _ in range(2))
-        index = torch.empty(batch, num_rays, most, dtype=torch.int64, device=features.device)
-        limit = reach_limit(opacity)
-        for entries, rays in _chunks(features, num_splats):
-            keys, over, at = _keys(
-                features[entries, rays], coefficients[entries], limit[entries], nearest[entries, rays]
-            )
-            keys = _first(keys, most)
-            rows = (keys & (2 ** _bits(num_splats) - 1)).long()
-            hit = keys < _missed(num_splats)
-            # opacity exp(-distance2 / 2) is FAINTEST exp(-over / 2), since over = distance2 - 2 log(opacity / FAINTEST)
-            faded = torch.gather(over, -1, rows).clamp_(max=0).mul_(-0.5).exp_().mul_(hit)
-            alpha[entries, rays] = faded.mul_(FAINTEST).clamp_(max=MAX_ALPHA)
-            t[entries, rays] = torch.gather(at, -1, rows).div_(_scale(num_splats)).masked_fill_(~hit, REACH)
-            index[entries, rays] = rows
+        flat, over, t = _near_pairs(coefficients, opacity, features)
+        ray = torch.div(flat, num_splats, rounding_mode="floor")
+        if bool((nearest > -REACH).any()):  # the camera is so near that Gaussians may lie behind it
+            is_before = ~(t <= nearest.flatten().index_select(0, ray))  # also of what is no number
+            if not bool(is_before.all()):
+                flat, ray, over, t = (values[is_before] for values in (flat, ray, over, t))
+        index = torch.add(flat, ray, alpha=-num_splats)
+        counts = torch.bincount(ray, minlength=batch * num_rays)
+        place = _first_of_each(t, ray, counts, most).flatten()
+        # opacity exp(-distance2 / 2) is FAINTEST exp(-over / 2), since over = distance2 - 2 log(opacity / FAINTEST)
+        alpha = over.mul_(-0.5).exp_().mul_(FAINTEST).clamp_(max=MAX_ALPHA)
+        alpha, t, index = (
+            pad(values, (0, 1), value=none).index_select(0, place).view(batch, num_rays, most)
+            for values, none in ((alpha, 0), (t, REACH), (index, 0))
+        )
         ctx.save_for_backward(coefficients, opacity, features, alpha, t, index)
         ctx.mark_non_differentiable(index)
         return alpha, t, index
@@ -109,8 +111,7 @@ class _Hits(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         coefficients, opacity, features, alpha, t, index = ctx.saved_tensors
         grad_alpha, grad_t = gradients[0], gradients[1]
-        free = (alpha < MAX_ALPHA) & (alpha > 0)
-        to_log = grad_alpha * free * alpha
+        to_log = grad_alpha * alpha * (alpha < MAX_ALPHA)
         grad_opacity = torch.zeros_like(opacity)
         grad_opacity.scatter_add_(-1, index.flatten(1), to_log.flatten(1)).div_(opacity.clamp(min=FAINTEST))
         to_distance2 = to_log * -0.5
@@ -125,10 +126,10 @@ class _Hits(torch.autograd.Function):
             to_b, to_e = 2 * at * g, at * at * g
             if inverse_e is not None:
                 to_b, to_e = to_b - to_t * inverse_e, to_e - to_t * at * inverse_e
-            dense = torch.zeros(*rows.shape[:2], coefficients.shape[-1], dtype=part.dtype, device=part.device)
+            dense = torch.empty(*rows.shape[:2], coefficients.shape[-1], dtype=part.dtype, device=part.device)
             into = grad_coefficients[entries]
             for slope, first, width in ((g, 0, 10), (to_b, 10, 9), (to_e, 19, 6)):
-                dense.scatter_(-1, rows, slope)  # the same places each time: no need to clear them
+                dense.zero_().scatter_add_(-1, rows, slope)
                 into[:, :width] += part[..., first : first + width].mT @ dense
                 if grad_features is not None:
                     own = coefficients[entries, :width].mT
@@ -149,41 +150,55 @@ def _chunks(features: Tensor, num_splats: int) -> list[tuple[slice, slice]]:
     ]
 
 
-def _keys(features: Tensor, coefficients: Tensor, limit: Tensor, nearest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Sortable keys (t above, number below; `_missed`: no hit), distance2 - limit and scaled t of peaks.
+def _near_pairs(coefficients: Tensor, opacity: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Rays and Gaussians that come near enough to each other: flat places in (entry, ray, splat), distance2 - limit, t.
 
-    No comparisons: they cost more than arithmetic. What is farther than its limit is pushed out of the range of t.
+    c - limit - b^2 / e < 0 is asked as (c - limit) e - b^2 < 0, so that what is too far, nearly all, is neither divided
+    nor sorted. What is no number counts as near: whoever looks at it shall see it.
     """
-    num_splats = coefficients.shape[-1]
-    scale = _scale(num_splats)
-    coefficients = coefficients.clone()
-    coefficients[:, 9] -= limit
-    over = features[..., :10] @ coefficients
-    b = (features[..., 10:19] * -scale) @ coefficients[:, :9]
-    t = b.div(features[..., 19:] @ coefficients[:, :6])
-    over.addcmul_(b, t, value=-1 / scale**2)
-    last = 2 ** (29 - _bits(num_splats))
-    place = torch.add(t, over.clamp(min=0), alpha=1e12)
-    if bool((nearest > -REACH).any()):  # the camera is so near that Gaussians may lie behind it
-        place = torch.where(t <= nearest[..., None] * scale, float(last), place)
-    numbers = torch.arange(num_splats, dtype=torch.int32, device=t.device)
-    keys = torch.add(numbers, place.clamp_(-last, last - 1).to(torch.int32), alpha=2 ** _bits(num_splats))
-    return keys, over, t
+    num_rays, num_splats = features.shape[1], opacity.shape[-1]
+    limited = coefficients.clone()
+    limited[:, 9] -= reach_limit(opacity)
+    chunks = _chunks(features, num_splats)
+    room = features.new_empty(3, features[chunks[0]].shape[:2].numel() * num_splats)
+    places, found = [], []
+    for entries, rays in chunks:
+        part, own = features[entries, rays], limited[entries]
+        shape = (*part.shape[:2], num_splats)
+        over, b, e = (values[: math.prod(shape)].view(shape) for values in room)
+        torch.matmul(part[..., 10:19], own[:, :9], out=b)
+        torch.matmul(part[..., 19:], own[:, :6], out=e)
+        torch.matmul(part[..., :10], own, out=over)
+        over.mul_(e).addcmul_(b, b, value=-1)
+        flat = _not_above_zero(over)
+        found.append(room.index_select(1, flat))
+        places.append(flat.add_((entries.start * num_rays + rays.start) * num_splats))
+    over, b, e = torch.cat(found, dim=1)
+    return torch.cat(places), over.div_(e), b.div_(e).neg_()
 
 
-def _bits(num_splats: int) -> int:
-    """Bits that a Gaussian's number takes in a key."""
-    return max(1, (num_splats - 1).bit_length())
+def _not_above_zero(values: Tensor) -> Tensor:
+    """Flat places of negative values and of what is no number; NumPy compares and finds 6 times as fast as torch."""
+    if values.device.type == "cpu":
+        return torch.from_numpy(np.flatnonzero(~(values.numpy() >= 0)))
+    return (~(values >= 0)).view(-1).nonzero().squeeze(-1)
 
 
-def _scale(num_splats: int) -> float:
-    """Steps of t per canonical unit: -reach to reach takes the bits that the number leaves of 30."""
-    return 2 ** (29 - _bits(num_splats)) / REACH
+def _first_of_each(
+    t: Float[Tensor, " pair"], ray: Int[Tensor, " pair"], counts: Int[Tensor, " ray"], most: int
+) -> Int[Tensor, "ray most"]:
+    """Places of each ray's `most` smallest t, ascending; where it has fewer, the number of pairs.
 
-
-def _missed(num_splats: int) -> int:
-    """The first key that is no hit: the last step of t."""
-    return (2 ** (29 - _bits(num_splats)) - 1) << _bits(num_splats)
+    Keys of 64 bits hold t, its bits turned so that they grow with it, above and the place below.
+    """
+    bits = t.float().view(torch.int32)
+    places = torch.arange(len(t), device=t.device)
+    keys = (bits ^ ((bits >> 31) & (2**31 - 1))).long().mul_(2**32).add_(places)
+    width = max(most, int(counts.max()))
+    own = torch.arange(len(counts), device=t.device).mul_(width).sub_(counts.cumsum(0) - counts)
+    table = keys.new_full((len(counts) * width,), (2**31 - 1) * 2**32 + len(t))
+    table = table.scatter_(0, places.add_(own.index_select(0, ray)), keys).view(-1, width)
+    return _first(table, most).bitwise_and_(2**32 - 1)
 
 
 def _first(keys: Tensor, most: int) -> Tensor:
@@ -191,7 +206,7 @@ def _first(keys: Tensor, most: int) -> Tensor:
     if keys.device.type == "cpu":
         array = keys.numpy()
         array.sort(axis=-1)
-        return torch.from_numpy(np.ascontiguousarray(array[..., :most]))
+        return torch.from_numpy(np.ascontiguousarray(array[:, :most]))
     return torch.topk(keys, most, dim=-1, largest=False, sorted=True).values
 
 
