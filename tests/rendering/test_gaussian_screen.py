@@ -14,11 +14,13 @@ from carstudio.rendering.gaussians.ellipses import Ellipses, ellipses_of
 from carstudio.rendering.gaussians.projection import bake_cloud, project
 from carstudio.rendering.gaussians.reference import responses
 from carstudio.rendering.gaussians.screen import draw_ellipses
+from carstudio.rendering.gaussians.screen_tiles import Band, pairs_met
 from carstudio.rendering.gaussians.tracing import SplattingConfig, render_cloud, splats_seen
 from carstudio.rendering.rays import image_rays, to_canonical
 from rendering.gaussian_scenes import car_box, random_cloud, surface_cloud
 
 FAR_M, FAR_SIDE = 500.0, 48
+WIDE = Camera(torch.tensor([130.0, 150.0, 40.0, 20.0]), 97, 75)
 FAR = Camera(torch.tensor([4200.0, 3900.0, 25.3, 21.8]), FAR_SIDE, FAR_SIDE)  # rays are nearly parallel
 
 
@@ -45,7 +47,7 @@ def test_ellipses_give_the_alphas_that_rays_meet_from_afar() -> None:
     )
     depth = (t + middle[..., None]) / canonical.stretch[..., None] * rays.directions[..., 2:]
     found = ellipses(cloud, camera, box)
-    u, v, uu, uv, vv, _, _, _, log_opacity, at, at_u, at_v = found.table[:, None, :]
+    u, v, uu, uv, vv, _, _, _, log_opacity, at, at_u, at_v = found.table[:12, None, :]
     x = (np.arange(FAR_SIDE**2) % FAR_SIDE + 0.5)[:, None] - u
     y = (np.arange(FAR_SIDE**2) // FAR_SIDE + 0.5)[:, None] - v
     mine = np.exp(log_opacity - (uu * x * x + 2 * uv * x * y + vv * y * y) / 2)
@@ -54,7 +56,7 @@ def test_ellipses_give_the_alphas_that_rays_meet_from_afar() -> None:
     lit = alpha[0].numpy() > 0.05
     assert np.abs(at + at_u * x + at_v * y - depth[0].numpy())[lit].max() < 0.02  # of half a kilometre
     eye = canonical.origins.mean(dim=1)
-    assert np.abs(found.rgb - cloud.colour_from(eye)[0].numpy()).max() < 1e-5
+    assert np.abs(found.table[12:].T - cloud.colour_from(eye)[0].numpy()).max() < 1e-5
 
 
 @pytest.mark.parametrize("shift_px", [0.0, 0.5])
@@ -75,6 +77,27 @@ def test_a_gaussian_alone_is_drawn_as_it_is_traced(shift_px: float) -> None:
             assert float((image[:, :3] - traced.rgb[0]).abs().max()) < 0.01
             lit = traced.opacity[0] > 0.1
             assert float((image[:, 4] - traced.depth_m[0])[lit].abs().max()) < 0.02
+
+
+def test_an_ellipse_enters_the_tiles_of_which_it_holds_a_pixel() -> None:
+    """Against every pixel centre tried with every ellipse; what slips in between pixel centres may be entered too."""
+    table = ellipses(random_cloud(80), WIDE, car_box(distance_m=5.0)).table[:8].astype(np.float64)
+    u, v, uu, uv, vv, limit = table[:6, :, None, None]
+    rows, columns = -(-WIDE.height // 4), -(-WIDE.width // 4)
+    y, x = np.mgrid[: rows * 4, : columns * 4] + 0.5
+    inside = uu * (x - u) ** 2 + 2 * uv * (x - u) * (y - v) + vv * (y - v) ** 2 < limit
+    is_met = inside.reshape(-1, rows, 4, columns, 4).any(axis=(2, 4))
+    assert is_met[:, 0].any()  # some reach over the picture's edge
+    found = np.zeros_like(is_met)
+    for first, count in ((0, 5), (5, rows - 5)):
+        pairs = pairs_met(table, Band(first, np.empty((count, columns, 4, 4, 5), np.float32)))
+        row, column = first + pairs.tile // columns, pairs.tile % columns
+        assert np.allclose(table[0, pairs.splat] + pairs.u, column * 4 + 2)
+        assert np.allclose(table[1, pairs.splat] + pairs.v, row * 4 + 2)
+        assert not found[pairs.splat, row, column].any()  # each pair once
+        found[pairs.splat, row, column] = True
+    assert not (is_met & ~found).any()
+    assert (found & ~is_met).sum() < 0.1 * is_met.sum()
 
 
 def test_bands_and_chunks_change_no_pixel(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -307,6 +307,32 @@ def test_a_tint_changes_colour_with_the_line_of_sight_only() -> None:
         assert torch.allclose(seen, torch.tensor([red, 0.5, 0.5], dtype=torch.float64), atol=1e-3)
 
 
+def test_peaks_a_micrometre_apart_keep_their_order() -> None:
+    """In float32, on a ray through the middle of a row of Gaussians, whichever is first in the cloud."""
+    at = (torch.arange(-4, 5) * 1e-6).flip(0)
+    mean = torch.stack([at, torch.zeros(9), torch.zeros(9)], dim=-1)[None]
+    cloud = GaussianCloud(
+        mean, torch.full((1, 9, 3), -2.0), torch.tensor([1.0, 0, 0, 0]).expand(1, 9, 4), torch.full((1, 9), 0.5), mean
+    )
+    point, direction = torch.zeros(1, 1, 3), torch.tensor([[[1.0, 0.0, 0.0]]])
+    _, t, index = hits.ray_hits(splats_of(cloud), point, direction, torch.full((1, 1), -9.0), most=9)
+    assert index[0, 0].tolist() == list(range(8, -1, -1))
+    assert torch.allclose(t[0, 0], at.flip(0), atol=1e-8)
+
+
+@pytest.mark.parametrize("is_near", [False, True])
+def test_what_is_no_number_is_seen(is_near: bool) -> None:
+    """A damaged Gaussian must not vanish from picture and loss."""
+    cloud = random_cloud(5)
+    broken = replace(cloud, mean=cloud.mean.index_fill(1, torch.tensor([2]), torch.nan))
+    points, directions = torch.zeros(1, 1, 3).double(), torch.tensor([[[0.0, 0.0, 1.0]]]).double()
+    nearest = torch.full((1, 1), -0.5 if is_near else -9.0).double()
+    for given, is_broken in ((cloud, False), (broken, True)):
+        alpha, _, index = hits.ray_hits(splats_of(given), points, directions, nearest, most=5)
+        assert bool(alpha.isnan().any()) is is_broken
+        assert not is_broken or 2 in index[alpha.isnan()].tolist()
+
+
 def test_rays_that_miss_the_box_meet_nothing() -> None:
     cloud, box = random_cloud(), car_box()
     rays = image_rays(camera(24))

@@ -11,15 +11,14 @@ from carstudio.rendering.gaussians.reference import MAX_ALPHA
 
 @dataclass(frozen=True)
 class Ellipses:
-    """Gaussians in an image, those alone that can be seen: a column of `table` and a colour each.
+    """Gaussians in an image, those alone that can be seen: a column each.
 
     Rows: u and v of the middle (px); the form's uu, uv and vv (px^-2); the squared distance at which the faintest alpha
     that counts is reached; half width and half height (px) of the ellipse up to there; log of the opacity; depth (m) of
-    the middle, and how the depth at which a ray's response peaks changes along u and v (m / px).
+    the middle, and how the depth at which a ray's response peaks changes along u and v (m / px); r, g, b.
     """
 
-    table: Float[np.ndarray, "12 splat"]
-    rgb: Float[np.ndarray, "splat 3"]
+    table: Float[np.ndarray, "15 splat"]
 
 
 def ellipses_of(seen: Projected) -> Ellipses:
@@ -28,11 +27,11 @@ def ellipses_of(seen: Projected) -> Ellipses:
     opacity = np.minimum(seen.opacity, MAX_ALPHA)
     limit = seen.limit
     spread = np.sqrt(np.maximum(limit, 0) / np.maximum(uu * vv - uv * uv, 1e-20))
-    table = np.stack(
-        [
-            *(seen.u, seen.v, uu, uv, vv, limit),
-            *(spread * np.sqrt(vv), spread * np.sqrt(uu)),
-            *(np.log(np.maximum(opacity, 1e-12)), seen.depth, -seen.depth * seen.g_u, -seen.depth * seen.g_v),
-        ]
+    rows = (
+        *(seen.u, seen.v, uu, uv, vv, limit, spread * np.sqrt(vv), spread * np.sqrt(uu)),
+        *(np.log(np.maximum(opacity, 1e-12)), seen.depth, -seen.depth * seen.g_u, -seen.depth * seen.g_v, *seen.rgb.T),
     )
-    return Ellipses(table[:, seen.is_seen].astype(np.float32), seen.rgb[seen.is_seen].astype(np.float32))
+    table = np.empty((len(rows), len(opacity)), np.float32)
+    for into, values in zip(table, rows, strict=True):
+        into[:] = values
+    return Ellipses(table if seen.is_seen.all() else np.ascontiguousarray(table[:, seen.is_seen]))

@@ -32,9 +32,10 @@ def ray_hits(
 ) -> tuple[Float[Tensor, "batch ray hit"], Float[Tensor, "batch ray hit"], Int[Tensor, "batch ray hit"]]:
     """The first `most` Gaussians along each ray x + t d whose alpha is worth showing, from front to back.
 
-    Gives alpha, t of the peak and the Gaussian's number; alpha and number are 0 where there are fewer. `directions` are unit vectors and
-    `points` within two units of the origin. Peaks at t <= `nearest` (the camera) count as missed. Gradients flow
-    through alpha and t, in closed form, to the splats and, where they are asked for, to points and directions.
+    Gives alpha, t of the peak and the Gaussian's number; alpha and number are 0 where there are fewer. `directions` are
+    unit vectors and `points` within two units of the origin. Peaks at t <= `nearest` (the camera) count as missed.
+    Gradients flow through alpha and t, in closed form, to the splats and, where they are asked for, to points and
+    directions.
     """
     features = torch.cat(ray_features(points, directions), dim=-1)
     return hits_of_features(splat_coefficients(splats), splats.opacity, features, nearest, most=most)

@@ -15,6 +15,7 @@ from carstudio.rendering.gaussians.reference import FAINTEST, MAX_ALPHA
 from carstudio.rendering.gaussians.screen_tiles import (
     MONOMIALS,
     PIXELS,
+    Band,
     composite_in_place,
     draw_by_bands,
     fullest_first,
@@ -83,10 +84,8 @@ class _Seen:
         )
 
 
-def _draw_band(
-    gaussians: _Seen, most: int, first_row: int, columns: int, into: Float[np.ndarray, "tile pixel 5"]
-) -> None:
-    met = pairs_met(gaussians.silhouettes, first_row, columns, len(into) // columns)
+def _draw_band(gaussians: _Seen, most: int, band: Band) -> None:
+    met = pairs_met(gaussians.silhouettes, band)
     if not len(met.tile):
         return
     order = np.argsort(met.tile.astype(np.uint16), kind="stable")  # of 16 bits: sorted in one pass
@@ -97,9 +96,9 @@ def _draw_band(
     channels = np.concatenate([gaussians.channels.take(splat, axis=0), np.zeros((1, 4), np.float32)])
     for tiles, place in fullest_first(tile):
         sums, depth = _composite(terms.take(place, axis=1), channels.take(place, axis=0), bits, most)
-        into[tiles, :, :4] = sums
         opacity = sums[..., 3]
-        into[tiles, :, 4] = np.where(opacity > 0, depth / np.maximum(opacity, 1e-8) / steps + gaussians.near_m, 0)
+        metric = np.where(opacity > 0, depth / np.maximum(opacity, 1e-8) / steps + gaussians.near_m, 0)
+        band.put(tiles, sums, metric)
 
 
 def _terms(

@@ -8,6 +8,7 @@ nearest to it at the depth z (d + a)^T C d / ((d + a)^T C (d + a)): exactly so, 
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 
 from carstudio.geometry.box3d import Box3D
@@ -16,6 +17,7 @@ from carstudio.rendering.gaussians.cloud import GaussianCloud, light_terms
 from carstudio.rendering.gaussians.reference import FAINTEST
 
 _PIXEL_VARIANCE = 1 / 12  # px^2, of a pixel's square along each axis; what `rays.pixel_rays` makes of it
+_UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _NEAREST_M = 1e-3  # no Gaussian of a box in front of the camera is so near
 
 
@@ -24,19 +26,21 @@ class BakedCloud:
     """Gaussians of one car (canonical frame) with covariances multiplied out, ready to be drawn again and again."""
 
     mean: Float[np.ndarray, "splat 3"]
-    covariance: Float[np.ndarray, "splat 3 3"]
+    covariance: Float[np.ndarray, "6 splat"]
+    """Rows xx, xy, xz, yy, yz and zz."""
     opacity: Float[np.ndarray, " splat"]
     rgb: Float[np.ndarray, "splat 3"]
-    tint: Float[np.ndarray, "splat 3 3"] | None
+    tint: Float[np.ndarray, "3 3 splat"] | None
+    """Channel, then axis of the line of sight."""
     light: Float[np.ndarray, "9 3"] | None
 
     def colour_from(self, eye: Float[np.ndarray, "3"]) -> Float[np.ndarray, "splat 3"]:
         """As `GaussianCloud.colour_from`."""
         colour = self.rgb
         if self.tint is not None:
-            sight = self.mean - eye
-            sight /= np.sqrt((sight * sight).sum(axis=-1, keepdims=True))
-            colour = np.clip(colour + (self.tint @ sight[..., None])[..., 0], 0, 1)
+            sight = (self.mean - eye).T
+            sight /= np.sqrt((sight * sight).sum(axis=0))
+            colour = np.minimum(np.maximum(colour + (self.tint * sight).sum(axis=1).T, 0), 1)
         if self.light is not None:
             x, y, z = (eye / np.sqrt((eye * eye).sum()))[:, None]
             colour = np.minimum(colour * np.exp(np.stack(light_terms(x, y, z), axis=-1) @ self.light), 1)
@@ -45,8 +49,16 @@ class BakedCloud:
 
 def bake_cloud(cloud: GaussianCloud) -> BakedCloud:
     """The first car of a batch: on the CPU, in single precision, without gradients."""
-    parts = cloud.mean, cloud.covariance().matrix(), cloud.opacity, cloud.rgb, cloud.tint, cloud.light
-    arrays = [None if part is None else part[0].detach().float().cpu().numpy() for part in parts]
+    covariance = cloud.covariance()
+    parts = (
+        cloud.mean,
+        torch.stack([covariance.xx, covariance.xy, covariance.xz, covariance.yy, covariance.yz, covariance.zz], dim=1),
+        cloud.opacity,
+        cloud.rgb,
+        None if cloud.tint is None else cloud.tint.permute(0, 2, 3, 1),
+        cloud.light,
+    )
+    arrays = [None if part is None else part[0].detach().float().cpu().contiguous().numpy() for part in parts]
     return BakedCloud(*arrays)  # type: ignore[arg-type]
 
 
@@ -97,7 +109,7 @@ def project(cloud: BakedCloud, camera: Camera, box: Box3D, *, widen: bool = True
     mean = cloud.mean @ linear.T + center
     depth = np.maximum(mean[:, 2], _NEAREST_M)
     x, y = mean[:, 0] / depth, mean[:, 1] / depth
-    xx, xy, xz, yy, yz, zz = _upper(linear @ cloud.covariance @ linear.T)
+    xx, xy, xz, yy, yz, zz = _turning(linear) @ cloud.covariance
     _, thin = _cofactors_along(x, y, xx, xy, xz, yy, yz, zz)
     if widen:
         footprint = depth * depth * (_PIXEL_VARIANCE / (fx * fy))
@@ -122,8 +134,15 @@ def project(cloud: BakedCloud, camera: Camera, box: Box3D, *, widen: bool = True
     )
 
 
-def _upper(matrix: np.ndarray) -> tuple[np.ndarray, ...]:
-    return tuple(matrix[:, i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)))
+def _turning(linear: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "6 6"]:
+    """What takes the upper triangle of a covariance S, row by row, to that of A S A^T."""
+    columns = []
+    for i, j in _UPPER:
+        unit = np.zeros((3, 3))
+        unit[i, j] = unit[j, i] = 1
+        turned = linear @ unit @ linear.T
+        columns.append([turned[row, column] for row, column in _UPPER])
+    return np.array(columns).T
 
 
 def _cofactors_along(

@@ -14,6 +14,7 @@ from carstudio.rendering.gaussians.ellipses import Ellipses
 from carstudio.rendering.gaussians.screen_tiles import (
     MONOMIALS,
     PIXELS,
+    Band,
     U,
     V,
     composite_in_place,
@@ -24,7 +25,8 @@ from carstudio.rendering.gaussians.screen_tiles import (
 
 _DEPTH_BITS = 20  # of a sort key
 _NOTHING = -1e4  # a logarithm whose exponential is 0
-_CHANNELS = 7  # r, g, b, 1, depth in the tile's middle, its change along u and v
+_FORM = [2, 3, 4, 8]  # rows of `Ellipses.table`: uu, uv, vv, log of the opacity
+_CHANNELS = 7  # depth in the tile's middle, its change along u and v, r, g, b, 1
 
 
 def draw_ellipses(ellipses: Ellipses, width: int, height: int) -> Float[np.ndarray, "height width 5"]:
@@ -32,20 +34,20 @@ def draw_ellipses(ellipses: Ellipses, width: int, height: int) -> Float[np.ndarr
     return draw_by_bands(width, height, partial(_draw_band, ellipses))
 
 
-def _draw_band(ellipses: Ellipses, first_row: int, columns: int, into: Float[np.ndarray, "tile pixel 5"]) -> None:
-    tile, terms, channels = _pairs(ellipses, first_row, columns, len(into) // columns)
+def _draw_band(ellipses: Ellipses, band: Band) -> None:
+    tile, terms, channels = _pairs(ellipses, band)
     for tiles, place in fullest_first(tile):
         weights = _weights(terms, place.T)
-        sums = np.matmul(weights.transpose(1, 2, 0), channels.take(place, axis=0))
-        depth = sums[..., 4] + sums[..., 5] * U + sums[..., 6] * V
-        into[tiles] = np.concatenate([sums[..., :4], (depth / np.maximum(sums[..., 3], 1e-8))[..., None]], axis=-1)
+        sums = np.matmul(weights.transpose(1, 2, 0), channels.take(place, axis=1).transpose(1, 2, 0))
+        depth = sums[..., 0] + sums[..., 1] * U + sums[..., 2] * V
+        band.put(tiles, sums[..., 3:], depth / np.maximum(sums[..., 6], 1e-8))
 
 
 def _weights(
-    terms: Float[np.ndarray, "pair 6"], place: Int[np.ndarray, "rank tile"]
+    terms: Float[np.ndarray, "6 pair"], place: Int[np.ndarray, "rank tile"]
 ) -> Float[np.ndarray, "rank tile pixel"]:
     """alpha_i prod_{j<i} (1 - alpha_j) of each tile's Gaussians, front first, in each of its pixels."""
-    weights = terms.take(place.ravel(), axis=0) @ MONOMIALS
+    weights = terms.take(place.ravel(), axis=1).T @ MONOMIALS
     np.exp(weights, out=weights)
     weights = weights.reshape(*place.shape, PIXELS)
     composite_in_place(weights)
@@ -53,28 +55,29 @@ def _weights(
 
 
 def _pairs(
-    ellipses: Ellipses, first_row: int, columns: int, rows: int
-) -> tuple[Int[np.ndarray, " pair"], Float[np.ndarray, "more_pairs 6"], Float[np.ndarray, "more_pairs 7"]]:
+    ellipses: Ellipses, band: Band
+) -> tuple[Int[np.ndarray, " pair"], Float[np.ndarray, "6 more_pairs"], Float[np.ndarray, "7 more_pairs"]]:
     """Tiles (ascending) and the Gaussians they meet from front to back: log alpha's terms and channels of each pair.
 
-    The last row of terms and channels is an extra one, of a Gaussian that is nowhere.
+    The last column is an extra one, of a Gaussian that is nowhere.
     """
-    met = pairs_met(ellipses.table[:8], first_row, columns, rows)
-    uu, uv, vv = ellipses.table[2:5].take(met.splat, axis=1)
-    log_opacity, depth, depth_u, depth_v = ellipses.table[8:].take(met.splat, axis=1)
+    met = pairs_met(ellipses.table[:8], band)
+    depth, depth_u, depth_v = ellipses.table[9:12].take(met.splat, axis=1)
     peak = depth + depth_u * met.u + depth_v * met.v
     order = _front_to_back(met.tile, peak)
     count = len(order)
-    terms, channels = np.empty((count + 1, 6), np.float32), np.empty((count + 1, _CHANNELS), np.float32)
-    terms[:count, 0] = (log_opacity - met.distance2 / 2)[order]
-    for column, values in enumerate((met.slope_u, met.slope_v, uu / 2, uv, vv / 2), start=1):
-        terms[:count, column] = -values[order]
-    channels[:count, :3] = ellipses.rgb.take(met.splat[order], axis=0)
-    for column, values in enumerate((peak, depth_u, depth_v), start=4):
-        channels[:count, column] = values[order]
-    channels[:count, 3] = 1
-    terms[count], channels[count] = (_NOTHING, 0, 0, 0, 0, 0), 0
-    return met.tile[order], terms, channels
+    splat, u, v = met.splat.take(order), met.u.take(order), met.v.take(order)
+    uu, uv, vv, log_opacity = ellipses.table[_FORM].take(splat, axis=1)
+    slope_u, slope_v = uu * u + uv * v, uv * u + vv * v
+    terms, channels = np.empty((6, count + 1), np.float32), np.empty((_CHANNELS, count + 1), np.float32)
+    terms[0, :count] = log_opacity - (slope_u * u + slope_v * v) / 2
+    for row, values in enumerate((slope_u, slope_v, uu / 2, uv, vv / 2), start=1):
+        np.negative(values, out=terms[row, :count])
+    channels[0, :count] = peak.take(order)
+    channels[1:6, :count] = ellipses.table[10:].take(splat, axis=1)
+    channels[6, :count] = 1
+    terms[:, count], channels[:, count] = (_NOTHING, 0, 0, 0, 0, 0), 0
+    return met.tile.take(order), terms, channels
 
 
 def _front_to_back(tile: Int[np.ndarray, " pair"], peak: Float[np.ndarray, " pair"]) -> Int[np.ndarray, " pair"]:
