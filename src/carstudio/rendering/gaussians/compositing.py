@@ -1,7 +1,7 @@
 """Hits composited front to back without ever laying out their colours: what `volume.composite` gives, in less time.
 
-w_i = alpha_i prod_{j<i} (1 - alpha_j). Spread over all Gaussians the weights make colour one matrix product. With
-u_i = dL/dw_i the slope is dL/dalpha_i = (w_i u_i / alpha_i) - (sum_{j>i} w_j u_j) / (1 - alpha_i).
+w_i = alpha_i prod_{j<i} (1 - alpha_j). Colours are looked up channel by channel, so that a hit takes one number at a
+time. With u_i = dL/dw_i the slope is dL/dalpha_i = (w_i u_i / alpha_i) - (sum_{j>i} w_j u_j) / (1 - alpha_i).
 """
 
 from typing import Any
@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-_CHUNK = {"cpu": 2**17, "other": 2**26}  # spread weights at a time: on a CPU they fit the cache
+from carstudio.rendering.gaussians.symmetric import planes
 
 
 def composite_hits(
@@ -19,10 +19,7 @@ def composite_hits(
     index: Int[Tensor, "batch ray hit"],
     rgb: Float[Tensor, "batch splat 3"],
 ) -> tuple[Float[Tensor, "batch ray 3"], Float[Tensor, "batch ray 2"], Float[Tensor, "batch ray hit"]]:
-    """Colour over black; opacity and weighted sum of t; the weights (without gradient).
-
-    Each Gaussian occurs once in a ray's `index`, but for places of alpha 0.
-    """
+    """Colour over black; opacity and weighted sum of t; the weights (without gradient)."""
     colour, sums, weights = _CompositeHits.apply(alpha, t, index, rgb)
     return colour, sums, weights
 
@@ -35,38 +32,36 @@ class _CompositeHits(torch.autograd.Function):
         weights = torch.log1p(-alpha).cumsum_(dim=-1).exp_().roll(1, dims=-1)  # what passes each hit, at the next
         weights[..., 0] = 1
         weights.mul_(alpha)
-        colour = torch.empty(*alpha.shape[:2], 3, dtype=rgb.dtype, device=rgb.device)
-        for rows in _rows(alpha, rgb.shape[1]):
-            colour[rows] = _spread(weights[rows], index[rows], rgb.shape[1]) @ rgb[rows]
+        place = _places(index, rgb.shape[1])
+        shown = [(_look_up(channel, place, index.shape).mul_(weights)).sum(dim=-1) for channel in planes(rgb)]
         sums = torch.stack([weights.sum(dim=-1), (weights * t).sum(dim=-1)], dim=-1)
         ctx.save_for_backward(alpha, t, index, rgb, weights)
         ctx.mark_non_differentiable(weights)
-        return colour, sums, weights
+        return torch.stack(shown, dim=-1), sums, weights
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         alpha, t, index, rgb, weights = ctx.saved_tensors
         to_colour, to_sums = gradients[0], gradients[1]
-        slope = torch.empty_like(alpha)
-        to_rgb = torch.empty_like(rgb)
-        for rows in _rows(alpha, rgb.shape[1]):
-            to_rgb[rows] = _spread(weights[rows], index[rows], rgb.shape[1]).mT @ to_colour[rows]
-            slope[rows] = torch.gather(to_colour[rows] @ rgb[rows].mT, -1, index[rows])
-        slope.add_(to_sums[..., :1]).addcmul_(to_sums[..., 1:], t)
+        place = _places(index, rgb.shape[1])
+        slope = to_sums[..., 1:] * t + to_sums[..., :1]
+        to_rgb = rgb.new_zeros(3, rgb.shape[0] * rgb.shape[1])
+        for into, own, given in zip(to_rgb, planes(rgb), planes(to_colour), strict=True):
+            slope.addcmul_(_look_up(own, place, index.shape), given[..., None])
+            into.scatter_add_(0, place, (weights * given[..., None]).flatten())
         lit = weights * slope
         behind = lit.sum(dim=-1, keepdim=True) - torch.cumsum(lit, dim=-1)
         through = weights / alpha.clamp(min=1e-12)  # what reaches the hit; where alpha is 0 nothing asks for it
         to_alpha = through * slope - behind / (1 - alpha)
-        return to_alpha, weights * to_sums[..., 1:], None, to_rgb
+        return to_alpha, weights * to_sums[..., 1:], None, to_rgb.T.reshape(rgb.shape)
 
 
-def _rows(alpha: Tensor, num_splats: int) -> list[slice]:
-    size = _CHUNK["cpu" if alpha.device.type == "cpu" else "other"]
-    rows = max(1, size // (alpha.shape[1] * num_splats))
-    return [slice(first, first + rows) for first in range(0, len(alpha), rows)]
+def _places(index: Int[Tensor, "batch ray hit"], num_splats: int) -> Int[Tensor, " all_hits"]:
+    """Where hits' Gaussians are when those of all entries stand in one row."""
+    first = torch.arange(0, len(index) * num_splats, num_splats, device=index.device)
+    return (index + first[:, None, None]).flatten()
 
 
-def _spread(values: Tensor, index: Tensor, num_splats: int) -> Tensor:
-    """(batch, ray, splat) of hits' values, 0 elsewhere."""
-    dense = torch.zeros(*values.shape[:2], num_splats, dtype=values.dtype, device=values.device)
-    return dense.scatter_add_(-1, index, values)
+def _look_up(values: Tensor, place: Tensor, shape: torch.Size) -> Tensor:
+    """One number of each Gaussian, for each hit."""
+    return values.flatten().index_select(0, place).view(shape)

@@ -16,9 +16,10 @@ from torch.nn.functional import pad
 
 from carstudio.rendering.gaussians.cloud import Splats
 from carstudio.rendering.gaussians.reference import FAINTEST, MAX_ALPHA
-from carstudio.rendering.gaussians.symmetric import dot, planes3
+from carstudio.rendering.gaussians.symmetric import Planes, dot, planes3
 
 _CHUNK = {"cpu": 2**17, "other": 2**26}  # ray-splat pairs at a time: on a CPU some arrays of them fit the L2 cache
+_PAIRS = ((0, 1), (0, 2), (1, 2))
 REACH = 4.0  # canonical units: farther from x than this along the ray no Gaussian of a box [-1, 1]^3 can peak
 
 
@@ -70,14 +71,29 @@ def ray_features(
     points: Float[Tensor, "batch ray 3"], directions: Float[Tensor, "batch ray 3"]
 ) -> tuple[Float[Tensor, "batch ray 10"], Float[Tensor, "batch ray 9"], Float[Tensor, "batch ray 6"]]:
     """Factors of the coefficients in c (10), b (the first 9) and e (the first 6)."""
-    x, d = points, directions
-    x0, x1, x2 = x.unbind(-1)
-    d0, d1, d2 = d.unbind(-1)
-    squares = torch.stack([x0 * x1, x0 * x2, x1 * x2], dim=-1)
-    c = torch.cat([x * x, 2 * squares, -2 * x, torch.ones_like(x[..., :1])], dim=-1)
-    mixed = torch.stack([d0 * x1 + d1 * x0, d0 * x2 + d2 * x0, d1 * x2 + d2 * x1], dim=-1)
-    e = torch.cat([d * d, 2 * torch.stack([d0 * d1, d0 * d2, d1 * d2], dim=-1)], dim=-1)
-    return c, torch.cat([d * x, mixed, -d], dim=-1), e
+    x, d = planes3(points), planes3(directions)
+    c, b, e = (torch.stack(factors, dim=-1) for factors in (_factors_of_c(x), _factors_of_b(x, d), _factors_of_e(d)))
+    return c, b, e
+
+
+def _factors_of_c(x: Planes) -> list[Tensor]:
+    return [*_factors_of_e(x), *(-2 * axis for axis in x), torch.ones_like(x[0])]
+
+
+def _factors_of_b(x: Planes, d: Planes) -> list[Tensor]:
+    mixed = [d[i] * x[j] + d[j] * x[i] for i, j in _PAIRS]
+    return [*(a * b for a, b in zip(d, x, strict=True)), *mixed, *(-axis for axis in d)]
+
+
+def _factors_of_e(d: Planes) -> list[Tensor]:
+    return [*(axis * axis for axis in d), *(2 * d[i] * d[j] for i, j in _PAIRS)]
+
+
+def _rays_of(features: Float[Tensor, "batch ray 25"], chosen: Int[Tensor, " pair"]) -> tuple[Planes, Planes]:
+    """Points and directions of chosen rays (counted through the batch): -2 x and -d are among the features."""
+    table = features.flatten(0, 1)[:, [6, 7, 8, 16, 17, 18]].T.contiguous().index_select(1, chosen)
+    x0, x1, x2, d0, d1, d2 = table.mul_(table.new_tensor([-0.5] * 3 + [-1.0] * 3)[:, None])
+    return (x0, x1, x2), (d0, d1, d2)
 
 
 class _Hits(torch.autograd.Function):
@@ -111,31 +127,44 @@ class _Hits(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         coefficients, opacity, features, alpha, t, index = ctx.saved_tensors
-        grad_alpha, grad_t = gradients[0], gradients[1]
-        to_log = grad_alpha * alpha * (alpha < MAX_ALPHA)
-        grad_opacity = torch.zeros_like(opacity)
-        grad_opacity.scatter_add_(-1, index.flatten(1), to_log.flatten(1)).div_(opacity.clamp(min=FAINTEST))
-        to_distance2 = to_log * -0.5
-        grad_coefficients = torch.zeros_like(coefficients)
-        grad_features = torch.zeros_like(features) if ctx.needs_input_grad[2] else None
-        for entries, rays in _chunks(features, coefficients.shape[-1]):
-            part, rows, at = features[entries, rays], index[entries, rays], t[entries, rays]
-            g = to_distance2[entries, rays]
-            # distance2 = c - b^2 / e and t = -b / e: their slopes in c, b and e are (1, 2 t, t^2) and (0, -1/e, -t/e).
-            to_t = torch.where(alpha[entries, rays] > 0, grad_t[entries, rays], 0.0)
-            inverse_e = _inverse_e(part, coefficients[entries], rows) if bool(to_t.any()) else None
-            to_b, to_e = 2 * at * g, at * at * g
-            if inverse_e is not None:
-                to_b, to_e = to_b - to_t * inverse_e, to_e - to_t * at * inverse_e
-            dense = torch.empty(*rows.shape[:2], coefficients.shape[-1], dtype=part.dtype, device=part.device)
-            into = grad_coefficients[entries]
-            for slope, first, width in ((g, 0, 10), (to_b, 10, 9), (to_e, 19, 6)):
-                dense.zero_().scatter_add_(-1, rows, slope)
-                into[:, :width] += part[..., first : first + width].mT @ dense
-                if grad_features is not None:
-                    own = coefficients[entries, :width].mT
-                    grad_features[entries, rays, first : first + width] = dense @ own
-        return grad_coefficients, grad_opacity, grad_features, None, None
+        place = _nonzero(alpha)
+        ray = torch.div(place, alpha.shape[-1], rounding_mode="floor")
+        alpha, t, splat, to_alpha, to_t = (
+            values.flatten().index_select(0, place) for values in (alpha, t, index, *gradients[:2])
+        )
+        splat += torch.div(ray, features.shape[1], rounding_mode="floor").mul_(opacity.shape[1])
+        to_log = to_alpha * alpha * (alpha < MAX_ALPHA)
+        to_opacity = opacity.new_zeros(opacity.numel()).scatter_add_(0, splat, to_log).view_as(opacity)
+        # distance2 = c - b^2 / e and t = -b / e. Along the ray c + 2 t b + t^2 e is c of the point x + t d, b + t e is
+        # its b: so the slopes in a Gaussian's numbers are those of c and b at the peak.
+        g, x, d = to_log.mul_(-0.5), *_rays_of(features, ray)
+        peak = (x[0] + t * d[0], x[1] + t * d[1], x[2] + t * d[2])
+        to_own = opacity.new_zeros(10, opacity.numel())
+        for into, factor in zip(to_own, _factors_of_c(peak), strict=True):
+            into.scatter_add_(0, splat, g * factor)
+        s = None
+        own = coefficients.transpose(0, 1).flatten(1)
+        if bool(to_t.any()):
+            s = to_t / sum(own[k].index_select(0, splat) * factor for k, factor in enumerate(_factors_of_e(d)))
+            for into, factor in zip(to_own, _factors_of_b(peak, d), strict=False):
+                into.scatter_add_(0, splat, -s * factor)
+        to_features = None
+        if ctx.needs_input_grad[2]:
+            slopes = (g, 2 * t * g, t * t * g) if s is None else (g, 2 * t * g - s, t * (t * g - s))
+            to_features = _to_features(features, slopes, own, ray, splat)
+        to_coefficients = to_own.unflatten(1, opacity.shape).transpose(0, 1)
+        return to_coefficients, to_opacity / opacity.clamp(min=FAINTEST), to_features, None, None
+
+
+def _to_features(
+    features: Tensor, slopes: tuple[Tensor, Tensor, Tensor], own: Tensor, ray: Tensor, splat: Tensor
+) -> Tensor:
+    """Slopes in the rays' features, of hits' slopes in c, b and e and the Gaussians' numbers."""
+    found = features.new_zeros(features.shape[-1], features[..., 0].numel())
+    for slope, first, width in zip(slopes, (0, 10, 19), (10, 9, 6), strict=True):
+        for k in range(width):
+            found[first + k].scatter_add_(0, ray, slope * own[k].index_select(0, splat))
+    return found.T.reshape(features.shape)
 
 
 def _chunks(features: Tensor, num_splats: int) -> list[tuple[slice, slice]]:
@@ -185,6 +214,13 @@ def _not_above_zero(values: Tensor) -> Tensor:
     return (~(values >= 0)).view(-1).nonzero().squeeze(-1)
 
 
+def _nonzero(values: Tensor) -> Tensor:
+    """Flat places of what is not 0."""
+    if values.device.type == "cpu":
+        return torch.from_numpy(np.flatnonzero(values.numpy() != 0))
+    return values.flatten().nonzero().squeeze(-1)
+
+
 def _first_of_each(
     t: Float[Tensor, " pair"], ray: Int[Tensor, " pair"], counts: Int[Tensor, " ray"], most: int
 ) -> Int[Tensor, "ray most"]:
@@ -209,8 +245,3 @@ def _first(keys: Tensor, most: int) -> Tensor:
         array.sort(axis=-1)
         return torch.from_numpy(np.ascontiguousarray(array[:, :most]))
     return torch.topk(keys, most, dim=-1, largest=False, sorted=True).values
-
-
-def _inverse_e(features: Tensor, coefficients: Tensor, rows: Tensor) -> Tensor:
-    """1 / e at the hits."""
-    return torch.gather(features[..., 19:] @ coefficients[:, :6], -1, rows).reciprocal()
