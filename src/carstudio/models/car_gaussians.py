@@ -186,12 +186,12 @@ def exchanged(
     may move the side a little beyond: colours stay in [0, 1].
     """
     share, half = ((1 + side) / 2)[:, None, None], rgb.shape[1] // 2
-    rgb = (share * rgb + (1 - share) * rgb.roll(half, dims=1)).clamp(0, 1)
+    rgb = torch.lerp(rgb.roll(half, dims=1), rgb, share).clamp(0, 1)
     if tint is not None:
         twins = tint.roll(half, dims=1) * tint.new_tensor([1.0, 1.0, -1.0])
-        tint = share[..., None] * tint + (1 - share[..., None]) * twins
+        tint = torch.lerp(twins, tint, share[..., None])
     if light is not None:
-        light = share * light + (1 - share) * mirrored_light(light)
+        light = torch.lerp(mirrored_light(light), light, share)
     return rgb, tint, light
 
 

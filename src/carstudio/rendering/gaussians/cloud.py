@@ -44,14 +44,16 @@ class GaussianCloud:
         return colour
 
     def covariance(self) -> Symmetric3:
-        """R diag(s^2) R^T."""
-        w, x, y, z = planes(torch.nn.functional.normalize(self.quaternion, dim=-1))
-        a, b, c = planes3(torch.exp(self.log_scale))
+        """R diag(s^2) R^T, of quaternions of any length."""
+        w, x, y, z = planes(self.quaternion)
         xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
         wx, wy, wz = w * x, w * y, w * z
-        first: Planes = ((1 - 2 * (yy + zz)) * a, 2 * (xy - wz) * b, 2 * (xz + wy) * c)  # rows of R diag(s)
-        second: Planes = (2 * (xy + wz) * a, (1 - 2 * (xx + zz)) * b, 2 * (yz - wx) * c)
-        third: Planes = (2 * (xz - wy) * a, 2 * (yz + wx) * b, (1 - 2 * (xx + yy)) * c)
+        twice = 2 / (w * w + xx + yy + zz)
+        a, b, c = planes3(torch.exp(self.log_scale))
+        a2, b2, c2 = twice * a, twice * b, twice * c
+        first: Planes = (a - (yy + zz) * a2, (xy - wz) * b2, (xz + wy) * c2)  # rows of R diag(s)
+        second: Planes = ((xy + wz) * a2, b - (xx + zz) * b2, (yz - wx) * c2)
+        third: Planes = ((xz - wy) * a2, (yz + wx) * b2, c - (xx + yy) * c2)
         rows = ((first, first), (first, second), (first, third), (second, second), (second, third), (third, third))
         return Symmetric3(*(dot(row, column) for row, column in rows))
 

@@ -106,7 +106,7 @@ class _Hits(torch.autograd.Function):
         batch, num_rays, num_splats = features.shape[0], features.shape[1], opacity.shape[-1]
         most = min(most, num_splats)
         flat, over, t = _near_pairs(coefficients, opacity, features)
-        ray = torch.div(flat, num_splats, rounding_mode="floor")
+        ray = _quotient(flat, num_splats)
         if bool((nearest > -REACH).any()):  # the camera is so near that Gaussians may lie behind it
             is_before = ~(t <= nearest.flatten().index_select(0, ray))  # also of what is no number
             if not bool(is_before.all()):
@@ -128,11 +128,11 @@ class _Hits(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         coefficients, opacity, features, alpha, t, index = ctx.saved_tensors
         place = _nonzero(alpha)
-        ray = torch.div(place, alpha.shape[-1], rounding_mode="floor")
+        ray = _quotient(place, alpha.shape[-1])
         alpha, t, splat, to_alpha, to_t = (
             values.flatten().index_select(0, place) for values in (alpha, t, index, *gradients[:2])
         )
-        splat += torch.div(ray, features.shape[1], rounding_mode="floor").mul_(opacity.shape[1])
+        splat += _quotient(ray, features.shape[1]).mul_(opacity.shape[1])
         to_log = to_alpha * alpha * (alpha < MAX_ALPHA)
         to_opacity = opacity.new_zeros(opacity.numel()).scatter_add_(0, splat, to_log).view_as(opacity)
         # distance2 = c - b^2 / e and t = -b / e. Along the ray c + 2 t b + t^2 e is c of the point x + t d, b + t e is
@@ -219,6 +219,13 @@ def _nonzero(values: Tensor) -> Tensor:
     if values.device.type == "cpu":
         return torch.from_numpy(np.flatnonzero(values.numpy() != 0))
     return values.flatten().nonzero().squeeze(-1)
+
+
+def _quotient(numbers: Tensor, divisor: int) -> Tensor:
+    """Whole quotients; NumPy divides by multiplying, in a quarter of torch's time."""
+    if numbers.device.type == "cpu":
+        return torch.from_numpy(numbers.numpy() // divisor)
+    return torch.div(numbers, divisor, rounding_mode="floor")
 
 
 def _first_of_each(
