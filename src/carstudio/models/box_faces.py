@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from carstudio.geometry.camera import Camera
 from carstudio.geometry.canonical import canonical_from_camera
 from carstudio.models.interface import PatchBatch
 
@@ -28,14 +29,13 @@ def box_faces(patches: PatchBatch, side_px: int) -> Float[Tensor, "batch 5 side 
     near_side = torch.where(eye[:, 2] >= 0, 1.0, -1.0).to(eye)
     one = torch.ones_like(near_side)
     to_camera = patches.box.rotation * (patches.box.size / 2 * torch.stack([one, one, near_side], dim=-1))[:, None]
-    in_camera = _planes(side_px, eye) @ to_camera.mT + patches.box.center[:, None]
+    to_image = _to_image(patches.camera)
+    seen_at = _planes(side_px, eye) @ (to_image @ to_camera).mT + (to_image @ patches.box.center[..., None]).mT
     half = side_px // 2
     counts = [half * side_px, half * half, half * half]
     before = torch.stack([eye[:, 2] * near_side, eye[:, 0], -eye[:, 0]], dim=-1) > PLANE
-    seen = before.repeat_interleave(torch.tensor(counts, device=eye.device), dim=1) & (in_camera[..., 2] > _NEAR_M)
-    in_camera = torch.cat([in_camera[..., :2], in_camera[..., 2:].clamp(min=_NEAR_M)], dim=-1)
-    size = eye.new_tensor([patches.camera.width, patches.camera.height])
-    place = (2 * patches.camera.project(in_camera) / size - 1).clamp(-9, 9)
+    seen = before.repeat_interleave(torch.tensor(counts, device=eye.device), dim=1) & (seen_at[..., 2] > _NEAR_M)
+    place = (seen_at[..., :2] / seen_at[..., 2:].clamp(min=_NEAR_M)).clamp(-9, 9)
     place = place.masked_fill(~seen[..., None], -9.0)  # far outside: sampled as 0
     mask = patches.mask[:, None]
     pixels = torch.cat([2 * patches.image - 1, mask, torch.ones_like(mask)], dim=1)
@@ -43,6 +43,15 @@ def box_faces(patches: PatchBatch, side_px: int) -> Float[Tensor, "batch 5 side 
     side, front, rear = found.squeeze(-1).split(counts, dim=-1)
     ends = torch.cat([front.unflatten(-1, (half, half)), rear.unflatten(-1, (half, half))], dim=-1)
     return torch.cat([side.unflatten(-1, (half, side_px)), ends], dim=-2)
+
+
+def _to_image(camera: Camera) -> Float[Tensor, "batch 3 3"]:
+    """Camera points to homogeneous places in the photo, whose sides are at -1 and 1."""
+    fx, fy, cx, cy = camera.intrinsics.unbind(-1)
+    zero, one = torch.zeros_like(fx), torch.ones_like(fx)
+    across = torch.stack([2 * fx / camera.width, zero, 2 * cx / camera.width - 1], dim=-1)
+    down = torch.stack([zero, 2 * fy / camera.height, 2 * cy / camera.height - 1], dim=-1)
+    return torch.stack([across, down, torch.stack([zero, zero, one], dim=-1)], dim=-2)
 
 
 def _planes(side_px: int, like: Tensor) -> Float[Tensor, "pixel 3"]:
