@@ -42,7 +42,7 @@ MAY_IMPORT = {
     "recipes": FIELD | {"errors", "training"},
     "comparison": FIELD | DATA | BASE | {"fitting", "training", "evaluation", "report", "recipes"},
 }
-DOORS = {"cli", "commands", "demo"}  # may import everything; nobody imports them
+DOORS = {"__main__", "cli", "commands", "demo"}  # may import everything; nobody imports them
 PICKLERS = {"pickle", "dill", "cloudpickle", "shelve", "joblib"}
 VAGUE_NAMES = {"utils.py", "util.py", "helpers.py", "common.py", "misc.py"}
 

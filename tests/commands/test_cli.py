@@ -108,7 +108,7 @@ def test_render_goes_round_the_car(trained: Path) -> None:
 
 
 def test_a_preview_is_nearly_the_picture(tmp_path: Path) -> None:
-    car = str(Path(carstudio.__file__).parent / "bundled" / "suv-red")
+    car = "suv-red"  # a bundled one, by its name
     for name, more in (("full", []), ("preview", ["--preview"])):
         command = ["render", car, "--out", str(tmp_path / name), "--views", "2", "--size", "96", "--device", "cpu"]
         assert run([*command, *more]) == 0
@@ -116,6 +116,17 @@ def test_a_preview_is_nearly_the_picture(tmp_path: Path) -> None:
         pair = [read_image(tmp_path / name / kind / "001.png").astype(float) for name in ("full", "preview")]
         assert pair[0].shape == pair[1].shape
         assert 0 < abs(pair[0] - pair[1]).mean() < 2.5, kind
+
+
+def test_a_bundled_car_is_exported_by_its_name(tmp_path: Path) -> None:
+    assert run(["export", "suv-red", "--format", "ply", "--out", str(tmp_path / "car.ply"), "--quiet"]) == 0
+    assert (tmp_path / "car.ply").read_bytes().startswith(b"ply")
+
+
+def test_the_package_runs_as_a_module() -> None:
+    """As torchrun starts it."""
+    found = subprocess.run([sys.executable, "-m", "carstudio", "--help"], capture_output=True, text=True, check=True)
+    assert all(verb in found.stdout for verb in VERBS)
 
 
 @pytest.mark.parametrize(

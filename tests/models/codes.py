@@ -6,7 +6,7 @@ import torch
 
 from carstudio.fitting.car_file import load_car
 from carstudio.models.interface import CategoryModel, Latents
-from carstudio.scene.shelf import bundled_cars
+from carstudio.training.bundled import bundled_cars
 
 
 def mean_latents(model: CategoryModel, cars: int = 1) -> Latents:

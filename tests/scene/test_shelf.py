@@ -11,8 +11,9 @@ from carstudio.fitting.car_file import load_car
 from carstudio.geometry.box3d import Box3D
 from carstudio.geometry.orbit import orbit_box, orbit_camera, orbit_distance
 from carstudio.models.interface import render_image
-from carstudio.scene.shelf import CarShelf, bundled_cars, copy_cars, find_car
+from carstudio.scene.shelf import CarShelf, copy_cars, find_car
 from carstudio.training.batches import stack_boxes
+from carstudio.training.bundled import bundled_cars
 from scene.made_up_scene import made_up_car, made_up_scene, scene_with_cars
 
 

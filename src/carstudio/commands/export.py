@@ -21,7 +21,7 @@ class Export(Output):
     """Write a car for other programs: metres, +Y up, +Z front, ground at Y = 0, centred in X and Z."""
 
     car: tyro.conf.Positional[Path]
-    """Folder of the car (`carstudio fit`)."""
+    """Folder of the car (`carstudio fit`), or the name of a bundled one (suv-red, sedan-white, hatchback-grey)."""
     format: Literal["glb", "ply"]
     """glb: a mesh with vertex colours, of any model. ply: Gaussians as splat viewers read them (car-gaussians only)."""
     out: Path

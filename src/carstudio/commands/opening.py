@@ -5,11 +5,16 @@ from pathlib import Path
 from carstudio.errors import InputError
 from carstudio.fitting.car_file import Car, load_car, put_weights
 from carstudio.models.interface import CategoryModel
+from carstudio.training.bundled import find_car_folder
 from carstudio.training.checkpoint import describe_model, folder_of_weights, load_model
 
 
-def open_car(folder: Path, run: Path | None) -> tuple[CategoryModel, Car]:
-    """The car of a folder and its model; `InputError` when it is another model than the one it was made with."""
+def open_car(path_or_name: Path, run: Path | None) -> tuple[CategoryModel, Car]:
+    """The car of a folder, or a bundled one by its name, and its model.
+
+    `InputError` when it is another model than the one it was made with.
+    """
+    folder = find_car_folder(path_or_name)
     car = load_car(folder)
     made_with = f"{car.model_name}, weights {car.model_sha256[:16]}"
     if run is not None and describe_model(run).sha256 != car.model_sha256:

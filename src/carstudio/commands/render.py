@@ -19,6 +19,7 @@ from carstudio.images import write_png
 from carstudio.models.interface import CategoryModel, Latents
 from carstudio.report.panels import Turntable, encode_patch, turntable
 from carstudio.report.video import write_gif, write_mp4
+from carstudio.training.bundled import find_car_folder
 from carstudio.training.checkpoint import load_model
 
 
@@ -27,7 +28,7 @@ class Render(Output):
     """Novel views of cars: a fitted car, or one photo each encoded by a model; then round the car."""
 
     model: tyro.conf.Positional[Path]
-    """Folder of a car (`carstudio fit`) or of a run, or the name of a bundled model."""
+    """Folder of a car (`carstudio fit`) or of a run, or the name of a bundled car or model."""
     data: Path | None = None
     """Of a run: the CarPatch3D store with the input photos."""
     out: Path
@@ -60,7 +61,7 @@ class Render(Output):
         """Render and write."""
         if self.views < 1 or not 8 <= self.size <= 4096:
             raise InputError(f"--views must be at least 1 and --size 8 to 4096, found {self.views} and {self.size}")
-        if (self.model / DESCRIPTION).exists():
+        if (find_car_folder(self.model) / DESCRIPTION).exists():
             return self._render_car()
         if self.data is None:
             raise InputError("--data STORE is needed: a run shows cars that it encodes from a store's photos")

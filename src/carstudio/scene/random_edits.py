@@ -12,8 +12,9 @@ from carstudio.errors import InputError
 from carstudio.scene.edits import Edit, Insert, Place
 from carstudio.scene.graph import PlacedBox, Scene, Track, Vector3
 from carstudio.scene.places import box_standing, collide, is_in_view, posed_frames, turn_y
-from carstudio.scene.shelf import CarShelf, bundled_cars, find_car
+from carstudio.scene.shelf import CarShelf, find_car
 from carstudio.scene.standing import Surroundings, boxes_along, surroundings_of
+from carstudio.training.bundled import bundled_cars
 
 LANE_M = 3.2  # between the middles of two lanes: streets have 2.75 to 3.5
 _TRIES = 100  # in vain: the road is full

@@ -10,7 +10,7 @@ from carstudio.fitting.car_file import DESCRIPTION, TENSORS, Car, load_car, put_
 from carstudio.models.interface import CategoryModel
 from carstudio.scene.edit_file import nearest
 from carstudio.scene.graph import CarRef, Scene
-from carstudio.training.bundled import bundled_models
+from carstudio.training.bundled import bundled_cars
 from carstudio.training.checkpoint import folder_of_weights, load_model
 
 CARS = "cars"
@@ -128,9 +128,3 @@ def find_car(scene: Scene, shelf: CarShelf, name: str) -> CarRef:
         f"no car {name!r}{nearest(name, known, 'cars')}; another track's car is track:ID, a CAR folder is made known "
         "with --cars FOLDER"
     )
-
-
-def bundled_cars() -> dict[str, Path]:
-    """Cars that come with the package: name -> folder."""
-    root = Path(next(iter(bundled_models().values()))).parent if bundled_models() else Path()
-    return {path.parent.name: path.parent for path in sorted(root.glob(f"*/{DESCRIPTION}"))}
