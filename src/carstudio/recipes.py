@@ -13,6 +13,7 @@ from carstudio.models.nsg import NSGConfig
 from carstudio.models.pixel_nerf import PixelNeRFConfig
 from carstudio.rendering.field import SamplingConfig
 from carstudio.rendering.gaussians.tracing import SplattingConfig
+from carstudio.training.batches import Supervision
 from carstudio.training.config import TrainConfig
 from carstudio.training.losses import LossConfig
 from carstudio.training.schedule import ScheduleConfig
@@ -194,3 +195,14 @@ def recipe(name: str) -> TrainConfig:
     if name not in RECIPES:
         raise InputError(f"recipe must be one of {', '.join(RECIPES)}, found {name!r}")
     return RECIPES[name]()
+
+
+def supervised(config: TrainConfig, supervision: Supervision) -> TrainConfig:
+    """The recipe with another supervision.
+
+    A model that knows a car as a seen and an unseen side learns nothing of the unseen one from a photo that explains
+    itself: with single-view supervision it is shown photos in the mirror too, as views of the other side.
+    """
+    has_sides = isinstance(config.model, CarGaussiansConfig) and config.model.encodes_left_views
+    is_short = has_sides and supervision == "single-view" and config.mirroring == "off"
+    return replace(config, supervision=supervision, mirroring="apart" if is_short else config.mirroring)

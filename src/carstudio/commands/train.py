@@ -10,7 +10,7 @@ from carstudio.commands.command import Outcome, Output, plain, provenance, split
 from carstudio.dataset.store import PatchStore, open_store
 from carstudio.errors import InputError
 from carstudio.models.interface import CategoryModel
-from carstudio.recipes import recipe
+from carstudio.recipes import recipe, supervised
 from carstudio.report.panels import views_panel
 from carstudio.signals import held_back_stops
 from carstudio.training.batches import Supervision
@@ -73,7 +73,7 @@ class Train(Output):
         if self.steps is not None:
             config = replace(config, steps=self.steps)
         if self.supervision is not None:
-            config = replace(config, supervision=self.supervision)
+            config = supervised(config, self.supervision)
         if self.box_noise is not None:
             if self.box_noise < 0:
                 raise InputError(f"--box-noise must be 0 or more, found {self.box_noise}")

@@ -24,7 +24,7 @@ from carstudio.evaluation.perceptual import load_lpips
 from carstudio.evaluation.tables import Table
 from carstudio.files import parse_json, read_json, write_json, write_text
 from carstudio.models.interface import CategoryModel, Latents
-from carstudio.recipes import recipe
+from carstudio.recipes import recipe, supervised
 from carstudio.training.checkpoint import describe_model
 
 FIELD_RATES = {"car-gaussians": 3e-3}  # numbers of Gaussians bear larger steps than weights of a network
@@ -50,7 +50,7 @@ def scratch_rows() -> list[Row]:
 
 
 def _row(name: str, title: str) -> Row:
-    return Row(name, title, replace(recipe(name), recipe=name, supervision="single-view"))
+    return Row(name, title, replace(supervised(recipe(name), "single-view"), recipe=name))
 
 
 def make_learning_curves(work: Work, fit_work: Work, rows: Sequence[Row], budget: Budget) -> list[Table]:

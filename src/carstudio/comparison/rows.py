@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 
 from carstudio.comparison.paper_figures import MULTI_VIEW, ZERO_SHOT, PaperFigures
 from carstudio.errors import InputError
-from carstudio.recipes import recipe
+from carstudio.recipes import recipe, supervised
+from carstudio.training.batches import Supervision
 from carstudio.training.config import TrainConfig
 
 SPLITS = {"zero-shot": "instance", "multi-view": "view", "scaling": "instance", "ttopt": "instance"}
@@ -60,9 +61,14 @@ def multi_view_rows() -> list[Row]:
 
 
 def _row(
-    name: str, title: str, recipe_name: str, supervision: str, paper: dict[str, PaperFigures], is_default: bool = True
+    name: str,
+    title: str,
+    recipe_name: str,
+    supervision: Supervision,
+    paper: dict[str, PaperFigures],
+    is_default: bool = True,
 ) -> Row:
-    config = replace(recipe(recipe_name), recipe=name, supervision=supervision)  # type: ignore[arg-type]
+    config = replace(supervised(recipe(recipe_name), supervision), recipe=name)
     return Row(name, title, config, paper.get(name), is_default)
 
 

@@ -24,7 +24,7 @@ from carstudio.evaluation.summary import estimate
 from carstudio.evaluation.tables import Cell, Mark, Table
 from carstudio.images import decode_image
 from carstudio.models.car_nerf import CarNeRFConfig
-from carstudio.recipes import recipe
+from carstudio.recipes import recipe, supervised
 from carstudio.report.plots import Point, curves
 from carstudio.training.batches import training_patches
 
@@ -61,7 +61,7 @@ def counts_for(available: int) -> list[int]:
 
 def _row(name: str, title: str, cars: int, recipe_name: str) -> Row:
     full = f"{name}-{cars}"
-    config = replace(recipe(recipe_name), recipe=full, supervision="single-view", most_cars=cars)
+    config = replace(supervised(recipe(recipe_name), "single-view"), recipe=full, most_cars=cars)
     return Row(full, f"{title}, {cars:,} cars", config)
 
 
