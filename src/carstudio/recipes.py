@@ -85,6 +85,7 @@ def car_gaussians() -> TrainConfig:
         second_moment=0.99,
         template_rate=10.0,
         supervision="mixed",
+        mirroring="apart-where-alone",
         box_noise=1.0,
         patches_per_step=32,
         rays_per_patch=256,
@@ -200,9 +201,8 @@ def recipe(name: str) -> TrainConfig:
 def supervised(config: TrainConfig, supervision: Supervision) -> TrainConfig:
     """The recipe with another supervision.
 
-    A model that knows a car as a seen and an unseen side learns nothing of the unseen one from a photo that explains
-    itself: with single-view supervision it is shown photos in the mirror too, as views of the other side.
+    A model that knows a car as a seen and an unseen side learns nothing of the unseen one from photos that explain
+    themselves: with single-view supervision all are shown in the mirror too, as views of the other side.
     """
-    has_sides = isinstance(config.model, CarGaussiansConfig) and config.model.encodes_left_views
-    is_short = has_sides and supervision == "single-view" and config.mirroring == "off"
+    is_short = supervision == "single-view" and config.mirroring == "apart-where-alone"
     return replace(config, supervision=supervision, mirroring="apart" if is_short else config.mirroring)

@@ -174,6 +174,23 @@ def test_mirroring_flips_half_of_the_photos_together_or_apart(store: PatchStore)
     assert 160 <= sum(pair[0] for pair in drawn["together"]) <= 240  # half of 400, four standard deviations
 
 
+def test_photos_of_cars_without_another_are_mirrored_apart(store: PatchStore) -> None:
+    """A car of one photo explains itself, so its mirror image stands for the side that is not seen."""
+    cache, patch_ids = PatchCache(store, 32), store.patch_ids()
+    car = dict(zip(*(store.table([name])[name].to_pylist() for name in ("patch_id", "instance_id")), strict=True))
+    several = [name for name in patch_ids if car[name] == car[patch_ids[0]]]
+    alone = next(name for name in patch_ids if car[name] != car[patch_ids[0]])
+    assert len(several) > 1
+    drawn: dict[bool, set[tuple[bool, bool]]] = {True: set(), False: set()}
+    sampler = StepSampler(
+        cache, [*several, alone], patches_per_step=5, supervision="mixed", seed=0, mirroring="apart-where-alone"
+    )
+    for step in range(60):
+        for name, pair in zip(sampler.input_ids(step), sampler.mirrored(step), strict=True):
+            drawn[name == alone].add(pair)
+    assert drawn == {True: {(a, b) for a in (False, True) for b in (False, True)}, False: {(False, False)}}
+
+
 def test_rough_boxes_are_those_of_encoded_photos_alone(store: PatchStore) -> None:
     """Same photos, pixels and rays; each photo's box is its own and the same whoever asks."""
     cache = PatchCache(store, 32)

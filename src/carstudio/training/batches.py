@@ -24,7 +24,7 @@ from carstudio.models.interface import PatchBatch
 from carstudio.rendering.rays import Rays, pixel_rays
 
 Supervision = Literal["single-view", "multi-view", "mixed"]
-Mirroring = Literal["off", "together", "apart"]
+Mirroring = Literal["off", "together", "apart", "apart-where-alone"]
 PixelDraws = Literal["anywhere", "in-cells"]
 # Standard deviations of labelled boxes' errors: place (share of the size), heading (degrees), size (share)
 PLACE_NOISE, HEADING_NOISE_DEG, SIZE_NOISE = 0.03, 3.0, 0.03
@@ -163,7 +163,8 @@ class StepSampler:
     another patch of the same car where it has one; `mixed` either with equal chance.
 
     Mirroring shows photos flipped left to right half of the time (a car is symmetric): encoded and explained patch
-    `together`, or each by its own draw, so that a flipped photo `apart` from the encoded one is a second view of it.
+    `together`, or each by its own draw, so that a flipped photo `apart` from the encoded one is a second view of it;
+    `apart-where-alone` does so with cars of a single photo, which no other photo explains.
     `box_noise` makes the boxes of encoded patches rough (`noisy_box`); those that are explained stay as they are.
     """
 
@@ -223,7 +224,14 @@ class StepSampler:
             return [(False, False)] * self.patches_per_step
         draws = torch.rand(self.patches_per_step, 2, generator=generator_for(self.seed, step, "mirror")) < 0.5
         second = 0 if self.mirroring == "together" else 1
-        return [(bool(row[0]), bool(row[second])) for row in draws]
+        flips = [(bool(row[0]), bool(row[second])) for row in draws]
+        if self.mirroring == "apart-where-alone":
+            shown = self.input_ids(step)
+            flips = [pair if self._is_alone(shown[row]) else (False, False) for row, pair in enumerate(flips)]
+        return flips
+
+    def _is_alone(self, patch_id: str) -> bool:
+        return len(self._views[self._instance_of[patch_id]]) == 1
 
     def batch(self, step: int, rays_per_patch: int, rows: range | None = None) -> tuple[PatchBatch, PixelBatch]:
         """Everything step `step` needs, or some rows of it: the same whoever else takes the others."""

@@ -26,7 +26,8 @@ class TrainConfig:
     supervision: Supervision = "single-view"
     """Which photo of the car an encoded photo must explain."""
     mirroring: Mirroring = "off"
-    """Whether photos are flipped left to right half of the time: never, input and explained photo alike, or each."""
+    """Whether photos are flipped left to right half of the time: never, input and explained photo alike, each by its
+    own draw, or that with cars of which there is but one photo."""
     box_noise: float = 0.0
     """How rough the boxes of encoded photos are made: 1: as labels and detectors are, 0: as they stand in the store."""
     patches_per_step: int = 3
