@@ -127,7 +127,7 @@ class _Hits(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         coefficients, opacity, features, alpha, t, index = ctx.saved_tensors
-        place = _nonzero(alpha)
+        place = _negative(-alpha)
         ray = _quotient(place, alpha.shape[-1])
         alpha, t, splat, to_alpha, to_t = (
             values.flatten().index_select(0, place) for values in (alpha, t, index, *gradients[:2])
@@ -200,25 +200,18 @@ def _near_pairs(coefficients: Tensor, opacity: Tensor, features: Tensor) -> tupl
         torch.matmul(part[..., 19:], own[:, :6], out=e)
         torch.matmul(part[..., :10], own, out=over)
         over.mul_(e).addcmul_(b, b, value=-1)
-        flat = _not_above_zero(over)
+        flat = _negative(over)
         found.append(room.index_select(1, flat))
         places.append(flat.add_((entries.start * num_rays + rays.start) * num_splats))
     over, b, e = torch.cat(found, dim=1)
     return torch.cat(places), over.div_(e), b.div_(e).neg_()
 
 
-def _not_above_zero(values: Tensor) -> Tensor:
+def _negative(values: Tensor) -> Tensor:
     """Flat places of negative values and of what is no number; NumPy compares and finds 6 times as fast as torch."""
     if values.device.type == "cpu":
         return torch.from_numpy(np.flatnonzero(~(values.numpy() >= 0)))
-    return (~(values >= 0)).view(-1).nonzero().squeeze(-1)
-
-
-def _nonzero(values: Tensor) -> Tensor:
-    """Flat places of what is not 0."""
-    if values.device.type == "cpu":
-        return torch.from_numpy(np.flatnonzero(values.numpy() != 0))
-    return values.flatten().nonzero().squeeze(-1)
+    return (~(values >= 0)).flatten().nonzero().squeeze(-1)
 
 
 def _quotient(numbers: Tensor, divisor: int) -> Tensor:
