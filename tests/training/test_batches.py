@@ -9,6 +9,9 @@ from carstudio.dataset.pixels import PatchCache, mirror_patch, prepare_patch
 from carstudio.dataset.store import PatchStore
 from carstudio.geometry.box3d import Box3D
 from carstudio.geometry.transforms import rotation_y
+from carstudio.rendering.gaussians.cloud import GaussianCloud, splats_of
+from carstudio.rendering.gaussians.tiles import tile_classes
+from carstudio.rendering.rays import to_canonical
 from carstudio.training.batches import (
     HEADING_NOISE_DEG,
     PLACE_NOISE,
@@ -19,6 +22,7 @@ from carstudio.training.batches import (
     noisy_box,
     pixel_batch,
 )
+from rendering.gaussian_scenes import random_cloud
 from training.toy import SIDE_PX, toy_store
 
 
@@ -104,9 +108,26 @@ def test_one_pixel_from_each_cell_and_the_rest_anywhere(store: PatchStore) -> No
     column, row = drawn_places(store, 70, "in-cells", seed=3)
     in_cells = torch.stack([row[:64] * 8 // SIDE_PX, column[:64] * 8 // SIDE_PX], dim=-1)  # 8 x 8 cells of whole pixels
     assert SIDE_PX % 8 == 0
-    assert in_cells.tolist() == [[cell // 8, cell % 8] for cell in range(64)]
+    tiles = [(top, left) for top in (0, 4) for left in (0, 4)]
+    assert in_cells.tolist() == [[top + i // 4, left + i % 4] for top, left in tiles for i in range(16)]
     assert len(set(zip(row.tolist(), column.tolist(), strict=True))) > 60
     assert not torch.equal(column[64:], drawn_places(store, 70, "in-cells", seed=4)[0][64:])
+
+
+def test_pixels_drawn_from_cells_come_in_tiles_of_rays(store: PatchStore) -> None:
+    """What is drawn `in-cells` is tried tile by tile, each with some Gaussians; what is drawn anywhere is not."""
+    patches = [prepare_patch(store.patch(f"toy-1-{view}"), 32) for view in range(3)]
+    cloud, found = random_cloud(60, torch.float32), []
+    splats = splats_of(GaussianCloud(*(part.expand(3, *part.shape[1:]) for part in list(vars(cloud).values())[:5])))
+    ways: tuple[PixelDraws, PixelDraws] = ("in-cells", "anywhere")
+    for draws in ways:
+        drawn = pixel_batch(patches, 256, torch.Generator().manual_seed(0), draws)
+        canonical = to_canonical(drawn.rays, drawn.box)
+        found.append(tile_classes(splats, canonical.origins, canonical.view_directions))
+    in_cells, anywhere = found
+    assert in_cells is not None
+    assert sum(int((one.splats < 60).sum()) for one in in_cells) < 0.6 * 3 * 16 * 60
+    assert anywhere is None
 
 
 def test_cells_draw_all_pixels_equally_often_and_means_with_less_noise(store: PatchStore) -> None:

@@ -21,6 +21,7 @@ from carstudio.errors import InputError
 from carstudio.geometry.box3d import Box3D, displaced_box
 from carstudio.geometry.camera import Camera
 from carstudio.models.interface import PatchBatch
+from carstudio.rendering.gaussians.tiles import TILE_PX
 from carstudio.rendering.rays import Rays, pixel_rays
 
 Supervision = Literal["single-view", "multi-view", "mixed"]
@@ -144,7 +145,7 @@ def pixel_batch(
 
 
 def _picked(height: int, width: int, count: int, generator: torch.Generator, draws: PixelDraws) -> Int[Tensor, " ray"]:
-    """Numbers of drawn pixels, counted row by row."""
+    """Numbers of drawn pixels, counted row by row; those of cells in 4 x 4 tiles of cells where they fill such."""
     cells = math.isqrt(count) if draws == "in-cells" else 0
     anywhere = torch.randint(height * width, (count - cells**2,), generator=generator)
     if not cells:
@@ -153,7 +154,14 @@ def _picked(height: int, width: int, count: int, generator: torch.Generator, dra
     numbers = torch.arange(cells)
     row = ((numbers[:, None] + drawn[0]) * (height / cells)).long().clamp(max=height - 1)
     column = ((numbers + drawn[1]) * (width / cells)).long().clamp(max=width - 1)
-    return torch.cat([(row * width + column).flatten(), anywhere])
+    return torch.cat([_by_tiles(row * width + column), anywhere])
+
+
+def _by_tiles(cells: Int[Tensor, "row column"]) -> Int[Tensor, " cell"]:
+    """Tile by tile, so that rays that follow each other lie together; row by row where the tiles do not fit."""
+    if len(cells) % TILE_PX:
+        return cells.flatten()
+    return cells.unflatten(0, (-1, TILE_PX)).unflatten(2, (-1, TILE_PX)).transpose(1, 2).flatten()
 
 
 class StepSampler:

@@ -8,15 +8,16 @@ The point x lies near the car, never at the camera: c - b^2 / e would cancel awa
 import math
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
 from carstudio.rendering.gaussians.cloud import Splats
-from carstudio.rendering.gaussians.reference import FAINTEST, MAX_ALPHA
+from carstudio.rendering.gaussians.cpu_kernels import first_sorted, places_of_negative, quotient
+from carstudio.rendering.gaussians.reference import FAINTEST, MAX_ALPHA, reach_limit
 from carstudio.rendering.gaussians.symmetric import Planes, dot, planes3
+from carstudio.rendering.gaussians.tiles import TILE, TileClass
 
 _CHUNK = {"cpu": 2**17, "other": 2**26}  # ray-splat pairs at a time: on a CPU some arrays of them fit the L2 cache
 _PAIRS = ((0, 1), (0, 2), (1, 2))
@@ -30,34 +31,20 @@ def ray_hits(
     nearest: Float[Tensor, "batch ray"],
     *,
     most: int,
+    classes: list[TileClass] | None = None,
 ) -> tuple[Float[Tensor, "batch ray hit"], Float[Tensor, "batch ray hit"], Int[Tensor, "batch ray hit"]]:
     """The first `most` Gaussians along each ray x + t d whose alpha is worth showing, from front to back.
 
     Gives alpha, t of the peak and the Gaussian's number; alpha and number are 0 where there are fewer. `directions` are
     unit vectors and `points` within two units of the origin. Peaks at t <= `nearest` (the camera) count as missed.
+    With `classes` rays are tried with what their tile may meet, else with all Gaussians.
     Gradients flow through alpha and t, in closed form, to the splats and, where they are asked for, to points and
     directions.
     """
     features = torch.cat(ray_features(points, directions), dim=-1)
-    return hits_of_features(splat_coefficients(splats), splats.opacity, features, nearest, most=most)
-
-
-def hits_of_features(
-    coefficients: Float[Tensor, "batch 10 splat"],
-    opacity: Float[Tensor, "batch splat"],
-    features: Float[Tensor, "batch ray 25"],
-    nearest: Float[Tensor, "batch ray"],
-    *,
-    most: int,
-) -> tuple[Float[Tensor, "batch ray hit"], Float[Tensor, "batch ray hit"], Int[Tensor, "batch ray hit"]]:
-    """`ray_hits` of what `splat_coefficients` and `ray_features` (joined) give; opacity 0 is never hit."""
-    alpha, t, index = _Hits.apply(coefficients, opacity, features, nearest, most)
+    coefficients = splat_coefficients(splats)
+    alpha, t, index = _Hits.apply(coefficients, splats.opacity, features, nearest, most, classes)
     return alpha, t, index
-
-
-def reach_limit(opacity: Float[Tensor, "batch splat"]) -> Float[Tensor, "batch splat"]:
-    """Squared distance at which a Gaussian's alpha is the faintest that counts; negative: it never does."""
-    return 2 * torch.log((opacity / FAINTEST).clamp(min=1e-12))
 
 
 def splat_coefficients(splats: Splats) -> Float[Tensor, "batch 10 splat"]:
@@ -101,25 +88,21 @@ class _Hits(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, coefficients: Tensor, opacity: Tensor, features: Tensor, nearest: Tensor, most: int
+        ctx: Any,
+        coefficients: Tensor,
+        opacity: Tensor,
+        features: Tensor,
+        nearest: Tensor,
+        most: int,
+        classes: list[TileClass] | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        batch, num_rays, num_splats = features.shape[0], features.shape[1], opacity.shape[-1]
-        most = min(most, num_splats)
-        flat, over, t = _near_pairs(coefficients, opacity, features)
-        ray = _quotient(flat, num_splats)
-        if bool((nearest > -REACH).any()):  # the camera is so near that Gaussians may lie behind it
-            is_before = ~(t <= nearest.flatten().index_select(0, ray))  # also of what is no number
-            if not bool(is_before.all()):
-                flat, ray, over, t = (values[is_before] for values in (flat, ray, over, t))
-        index = torch.add(flat, ray, alpha=-num_splats)
-        counts = torch.bincount(ray, minlength=batch * num_rays)
-        place = _first_of_each(t, ray, counts, most).flatten()
-        # opacity exp(-distance2 / 2) is FAINTEST exp(-over / 2), since over = distance2 - 2 log(opacity / FAINTEST)
-        alpha = over.mul_(-0.5).exp_().mul_(FAINTEST).clamp_(max=MAX_ALPHA)
-        alpha, t, index = (
-            pad(values, (0, 1), value=none).index_select(0, place).view(batch, num_rays, most)
-            for values, none in ((alpha, 0), (t, REACH), (index, 0))
-        )
+        most = min(most, opacity.shape[-1])
+        limited = coefficients.clone()
+        limited[:, 9] -= reach_limit(opacity)
+        if classes is None:
+            alpha, t, index = _nearest_hits(limited, features, nearest, most)
+        else:
+            alpha, t, index = _hits_by_tiles(limited, features, nearest, most, classes)
         ctx.save_for_backward(coefficients, opacity, features, alpha, t, index)
         ctx.mark_non_differentiable(index)
         return alpha, t, index
@@ -127,12 +110,12 @@ class _Hits(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         coefficients, opacity, features, alpha, t, index = ctx.saved_tensors
-        place = _negative(-alpha)
-        ray = _quotient(place, alpha.shape[-1])
+        place = places_of_negative(-alpha)
+        ray = quotient(place, alpha.shape[-1])
         alpha, t, splat, to_alpha, to_t = (
             values.flatten().index_select(0, place) for values in (alpha, t, index, *gradients[:2])
         )
-        splat += _quotient(ray, features.shape[1]).mul_(opacity.shape[1])
+        splat += quotient(ray, features.shape[1]).mul_(opacity.shape[1])
         to_log = to_alpha * alpha * (alpha < MAX_ALPHA)
         to_opacity = opacity.new_zeros(opacity.numel()).scatter_add_(0, splat, to_log).view_as(opacity)
         # distance2 = c - b^2 / e and t = -b / e. Along the ray c + 2 t b + t^2 e is c of the point x + t d, b + t e is
@@ -153,7 +136,7 @@ class _Hits(torch.autograd.Function):
             slopes = (g, 2 * t * g, t * t * g) if s is None else (g, 2 * t * g - s, t * (t * g - s))
             to_features = _to_features(features, slopes, own, ray, splat)
         to_coefficients = to_own.unflatten(1, opacity.shape).transpose(0, 1)
-        return to_coefficients, to_opacity / opacity.clamp(min=FAINTEST), to_features, None, None
+        return to_coefficients, to_opacity / opacity.clamp(min=FAINTEST), to_features, None, None, None
 
 
 def _to_features(
@@ -180,15 +163,66 @@ def _chunks(features: Tensor, num_splats: int) -> list[tuple[slice, slice]]:
     ]
 
 
-def _near_pairs(coefficients: Tensor, opacity: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _hits_by_tiles(
+    limited: Tensor, features: Tensor, nearest: Tensor, most: int, classes: list[TileClass]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`_nearest_hits` of all rays, each tile's with what the tile may meet."""
+    batch, num_rays, num_splats = len(features), features.shape[1], limited.shape[-1]
+    table = pad(limited.mT, (0, 0, 0, 1)).flatten(0, 1)  # with a row of zeros for none, which is never near
+    by_tile, nearest = features.unflatten(1, (-1, TILE)).flatten(0, 1), nearest.reshape(-1, TILE)
+    found = (
+        features.new_zeros(len(by_tile), TILE, most),
+        features.new_full((len(by_tile), TILE, most), REACH),
+        torch.zeros(len(by_tile), TILE, most, dtype=torch.long, device=features.device),
+    )
+    for one in classes:
+        row = one.splats + quotient(one.tiles, num_rays // TILE)[:, None] * (num_splats + 1)
+        own = table.index_select(0, row.flatten()).unflatten(0, row.shape).mT
+        hits = _nearest_hits(own, by_tile[one.tiles], nearest[one.tiles], most, one.splats)
+        for into, part in zip(found, hits, strict=True):
+            into.index_copy_(0, one.tiles, part)
+    alpha, t, index = (values.view(batch, num_rays, most) for values in found)
+    return alpha, t, index
+
+
+def _nearest_hits(
+    limited: Float[Tensor, "batch 10 splat"],
+    features: Float[Tensor, "batch ray 25"],
+    nearest: Float[Tensor, "batch ray"],
+    most: int,
+    numbers: Int[Tensor, "batch splat"] | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """alpha, t and number of the first hits; in `limited` the reach is taken off c. Without `numbers` they count up."""
+    num_splats = limited.shape[-1]
+    flat, over, t = _near_pairs(limited, features)
+    ray = quotient(flat, num_splats)
+    if bool((nearest > -REACH).any()):  # the camera is so near that Gaussians may lie behind it
+        is_before = ~(t <= nearest.flatten().index_select(0, ray))  # also of what is no number
+        if not bool(is_before.all()):
+            flat, ray, over, t = (values[is_before] for values in (flat, ray, over, t))
+    counts = torch.bincount(ray, minlength=nearest.numel())
+    place = _first_of_each(t, ray, counts, most).flatten()
+    if numbers is None:
+        index = torch.add(flat, ray, alpha=-num_splats)
+    else:
+        entry = quotient(ray, features.shape[1])
+        index = numbers.flatten().index_select(0, flat.sub_(ray.sub_(entry), alpha=num_splats))
+    # opacity exp(-distance2 / 2) is FAINTEST exp(-over / 2), since over = distance2 - 2 log(opacity / FAINTEST)
+    alpha = over.mul_(-0.5).exp_().mul_(FAINTEST).clamp_(max=MAX_ALPHA)
+    alpha, t, index = (
+        pad(values, (0, 1), value=none).index_select(0, place).view(*nearest.shape, most)
+        for values, none in ((alpha, 0), (t, REACH), (index, 0))
+    )
+    return alpha, t, index
+
+
+def _near_pairs(limited: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Rays and Gaussians that come near enough to each other: flat places in (entry, ray, splat), distance2 - limit, t.
 
     c - limit - b^2 / e < 0 is asked as (c - limit) e - b^2 < 0, so that what is too far, nearly all, is neither divided
     nor sorted. What is no number counts as near: whoever looks at it shall see it.
     """
-    num_rays, num_splats = features.shape[1], opacity.shape[-1]
-    limited = coefficients.clone()
-    limited[:, 9] -= reach_limit(opacity)
+    num_rays, num_splats = features.shape[1], limited.shape[-1]
     chunks = _chunks(features, num_splats)
     room = features.new_empty(3, features[chunks[0]].shape[:2].numel() * num_splats)
     places, found = [], []
@@ -200,25 +234,11 @@ def _near_pairs(coefficients: Tensor, opacity: Tensor, features: Tensor) -> tupl
         torch.matmul(part[..., 19:], own[:, :6], out=e)
         torch.matmul(part[..., :10], own, out=over)
         over.mul_(e).addcmul_(b, b, value=-1)
-        flat = _negative(over)
+        flat = places_of_negative(over)
         found.append(room.index_select(1, flat))
         places.append(flat.add_((entries.start * num_rays + rays.start) * num_splats))
     over, b, e = torch.cat(found, dim=1)
     return torch.cat(places), over.div_(e), b.div_(e).neg_()
-
-
-def _negative(values: Tensor) -> Tensor:
-    """Flat places of negative values and of what is no number; NumPy compares and finds 6 times as fast as torch."""
-    if values.device.type == "cpu":
-        return torch.from_numpy(np.flatnonzero(~(values.numpy() >= 0)))
-    return (~(values >= 0)).flatten().nonzero().squeeze(-1)
-
-
-def _quotient(numbers: Tensor, divisor: int) -> Tensor:
-    """Whole quotients; NumPy divides by multiplying, in a quarter of torch's time."""
-    if numbers.device.type == "cpu":
-        return torch.from_numpy(numbers.numpy() // divisor)
-    return torch.div(numbers, divisor, rounding_mode="floor")
 
 
 def _first_of_each(
@@ -235,13 +255,4 @@ def _first_of_each(
     own = torch.arange(len(counts), device=t.device).mul_(width).sub_(counts.cumsum(0) - counts)
     table = keys.new_full((len(counts) * width,), (2**31 - 1) * 2**32 + len(t))
     table = table.scatter_(0, places.add_(own.index_select(0, ray)), keys).view(-1, width)
-    return _first(table, most).bitwise_and_(2**32 - 1)
-
-
-def _first(keys: Tensor, most: int) -> Tensor:
-    """The smallest `most` keys of each row, ascending; on CPUs NumPy sorts 30 times as fast as torch."""
-    if keys.device.type == "cpu":
-        array = keys.numpy()
-        array.sort(axis=-1)
-        return torch.from_numpy(np.ascontiguousarray(array[:, :most]))
-    return torch.topk(keys, most, dim=-1, largest=False, sorted=True).values
+    return first_sorted(table, most).bitwise_and_(2**32 - 1)

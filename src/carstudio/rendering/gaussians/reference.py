@@ -14,6 +14,11 @@ FAINTEST = 1.0 / 256  # an alpha below it counts as 0, or every Gaussian would b
 MAX_ALPHA = 0.999  # of one Gaussian: some light comes through, so that gradients reach what lies behind
 
 
+def reach_limit(opacity: Float[Tensor, "batch splat"]) -> Float[Tensor, "batch splat"]:
+    """Squared distance at which a Gaussian's alpha is the faintest that counts; negative: it never does."""
+    return 2 * torch.log((opacity / FAINTEST).clamp(min=1e-12))
+
+
 def responses(
     splats: Splats, points: Float[Tensor, "batch ray 3"], directions: Float[Tensor, "batch ray 3"]
 ) -> tuple[Float[Tensor, "batch ray splat"], Float[Tensor, "batch ray splat"]]:

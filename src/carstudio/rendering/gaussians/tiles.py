@@ -1,8 +1,10 @@
 """Leaving out early what a whole tile of rays misses, so that cost grows slower than the number of Gaussians.
 
-Rays that follow each other (the 16 of a 4 x 4 tile) are met as one thick ray first: with every Gaussian's reach grown
-by the tile's radius, what the middle ray misses all of them miss. Only the rest is tried ray by ray. Tiles that may
-meet about as many Gaussians are worked on together, so that few are padded to the fullest's count.
+A tile is 16 rays that follow each other: 4 x 4 pixels of a picture, or one pixel of each of 4 x 4 cells of a photo. Its
+bearings (x / z and y / z of a frame that looks from the camera at the box's middle) lie in a rectangle, and so do those
+of all of a Gaussian that counts; where the rectangles are apart no ray of the tile meets the Gaussian. Only the rest is
+tried ray by ray. Tiles that may meet about as many Gaussians are worked on together, so that few are padded to the
+fullest's count.
 """
 
 from dataclasses import dataclass
@@ -10,96 +12,126 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import normalize, one_hot, pad
 
 from carstudio.rendering.gaussians.cloud import Splats
-from carstudio.rendering.gaussians.hits import ray_features, reach_limit, splat_coefficients
+from carstudio.rendering.gaussians.cpu_kernels import places_of, quotient
+from carstudio.rendering.gaussians.reference import reach_limit
+from carstudio.rendering.gaussians.symmetric import Symmetric3, planes3
 
 TILE_PX = 4
 TILE = TILE_PX**2  # rays that are tried together
-COHERENT = 0.7  # canonical radius up to which a group of rays is a tile; scattered rays are tried one by one
+LARGEST_TILE = 0.25  # of all bearings; rays whose tiles are larger are scattered, and tried one by one
 CLASSES = 4  # of tiles by how many Gaussians they may meet, each of as many tiles
-_INSIDE = 1.75  # canonical units from the middle of a ray to where it leaves the box, at most sqrt(3)
-_SHARE = 0.5  # of the outer ellipsoid: (1 + a) Sigma + (1 + 1 / a) r^2 / limit holds ellipsoid plus ball for any a > 0
+_SAME_EYE = 1e-4  # canonical units
+_NEAREST_EYE = 2.0  # canonical units from the middle: nearer than that the box may be on all sides
+_MARGIN = 1e-3  # share of a Gaussian's squared reach, for rounding
 
 
 @dataclass(frozen=True)
-class Encounter:
-    """Groups of rays and the Gaussians each of them may meet, as products take them (`hits`), with their colours."""
+class TileClass:
+    """Some tiles and the Gaussians that each may meet."""
 
-    coefficients: Float[Tensor, "group 10 splat"]
-    opacity: Float[Tensor, "group splat"]
-    rgb: Float[Tensor, "group splat 3"]
-    features: Float[Tensor, "group ray 25"]
-    nearest: Float[Tensor, "group ray"]
-    groups: Int[Tensor, " group"] | None = None
-    """Numbers of the groups among all tiles; None: these are all groups, the batch's entries."""
+    tiles: Int[Tensor, " tile"]
+    """Numbers among all tiles of the batch."""
+    splats: Int[Tensor, "tile candidate"]
+    """Numbers in the tile's batch entry; the number of Gaussians stands for none."""
 
 
-def encounter(
-    splats: Splats,
-    rgb: Float[Tensor, "batch splat 3"],
-    points: Float[Tensor, "batch ray 3"],
-    directions: Float[Tensor, "batch ray 3"],
-    nearest: Float[Tensor, "batch ray"],
-) -> list[Encounter]:
-    """By tiles where the rays come in tiles that lie together; else every ray of a batch entry with every Gaussian.
+def tile_classes(
+    splats: Splats, origins: Float[Tensor, "batch ray 3"], directions: Float[Tensor, "batch ray 3"]
+) -> list[TileClass] | None:
+    """Tiles that may meet a Gaussian, by how many; None where all rays are to be tried with all Gaussians.
 
-    Tiles that can meet none are in no encounter.
+    That is: where they do not come in tiles, leave from different places (canonical), or where a tile is hardly smaller
+    than all of them.
     """
-    coefficients = splat_coefficients(splats)
-    features = torch.cat(ray_features(points, directions), dim=-1)
-    whole = [Encounter(coefficients, splats.opacity, rgb, features, nearest)]
-    if points.shape[1] % TILE:
-        return whole
+    if origins.shape[1] == 0 or origins.shape[1] % TILE:
+        return None
     with torch.no_grad():
-        tiles = (points.unflatten(1, (-1, TILE)).flatten(0, 1), directions.unflatten(1, (-1, TILE)).flatten(0, 1))
-        middle, toward, radius = tile_radius(*tiles)
-        if float(radius) > COHERENT:
-            return whole
-        is_met = _is_met(splats, middle, toward, radius, len(points))
-        counts = is_met.sum(dim=-1)
-        by_count = counts.argsort()[int((counts == 0).sum()) :]
-        if len(by_count) == 0:
-            return whole
-        classes = by_count.tensor_split(min(CLASSES, max(1, len(by_count) // TILE)))
-    table = torch.cat([coefficients.mT, splats.opacity[..., None], rgb], dim=-1).flatten(0, 1)
-    features = features.unflatten(1, (-1, TILE)).flatten(0, 1)
-    nearest = nearest.unflatten(1, (-1, TILE)).flatten(0, 1)
+        eye = origins[:, 0]
+        if bool(((origins - eye[:, None]).abs() > _SAME_EYE).any()) or bool((eye.norm(dim=-1) < _NEAREST_EYE).any()):
+            return None
+        axes = _looking_at_the_middle(eye)
+        seen = directions @ axes.mT
+        if bool((seen[..., 2] <= 0).any()):
+            return None
+        bearings = (seen[..., :2] / seen[..., 2:]).movedim(-1, 0).unflatten(2, (-1, TILE))
+        tiles = (bearings.amin(dim=-1), bearings.amax(dim=-1))
+        extent = tiles[1].amax(dim=-1) - tiles[0].amin(dim=-1)
+        share = (tiles[1] - tiles[0]).prod(dim=0).mean(dim=-1) / extent.prod(dim=0).clamp(min=1e-12)
+        if float(share.mean()) > LARGEST_TILE:
+            return None
+        return _classes(_is_met(tiles, _rectangles(splats, eye, axes)))
+
+
+Rectangles = tuple[Float[Tensor, "2 batch _"], Float[Tensor, "2 batch _"]]
+"""Least and largest bearings on both axes."""
+
+
+def _looking_at_the_middle(eye: Float[Tensor, "batch 3"]) -> Float[Tensor, "batch 3 3"]:
+    """Rows: unit vectors across, across and towards the origin from an eye."""
+    toward = -normalize(eye, dim=-1)
+    across = normalize(torch.linalg.cross(one_hot(toward.abs().argmin(dim=-1), 3).to(toward), toward), dim=-1)
+    return torch.stack([across, torch.linalg.cross(toward, across), toward], dim=1)
+
+
+def _rectangles(splats: Splats, eye: Float[Tensor, "batch 3"], axes: Float[Tensor, "batch 3 3"]) -> Rectangles:
+    """Of the bearings at which Gaussians count; endless where one reaches to the eye's plane, none where too faint.
+
+    With mean (x, z) and reach S (a covariance times the squared distance that counts) a bearing s touches the ellipsoid
+    where (x - s z)^2 = S_xx - 2 s S_xz + s^2 S_zz.
+    """
+    limit = reach_limit(splats.opacity)
+    reach = (_turned(splats.precision.inverse(), axes) * (limit.clamp(min=0) * (1 + _MARGIN))[:, None]).unbind(1)
+    mean = planes3((splats.mean - eye[:, None]) @ axes.mT)
+    zz = mean[2] * mean[2] - reach[0]
+    ends = []
+    for x, s_xx, s_xz in zip(mean[:2], reach[1:3], reach[3:], strict=True):
+        xz, xx = x * mean[2] - s_xz, x * x - s_xx
+        root = (xz * xz - zz * xx).clamp(min=0).sqrt()
+        ends.append(((xz - root) / zz, (xz + root) / zz))
+    low, high = (torch.stack(end) for end in zip(*ends, strict=True))
+    is_near, is_faint = zz <= 0, limit <= 0
+    return low.masked_fill(is_near, -torch.inf).masked_fill(is_faint, torch.inf), high.masked_fill(is_near, torch.inf)
+
+
+def _turned(matrices: Symmetric3, axes: Float[Tensor, "batch 3 3"]) -> Float[Tensor, "batch 5 splat"]:
+    """zz, xx, yy, xz and yz of A M A^T for the rows A of each entry's axes: one product, as a^T M b is linear in M."""
+    first, second = axes[:, [2, 0, 1, 0, 1]], axes[:, [2, 0, 1, 2, 2]]
+    both = first[..., :, None] * second[..., None, :]
+    own = Symmetric3.of_matrix(both + both.mT)
+    halves = torch.stack([own.xx / 2, own.xy, own.xz, own.yy / 2, own.yz, own.zz / 2], dim=-1)
+    m = matrices
+    return halves @ torch.stack([m.xx, m.xy, m.xz, m.yy, m.yz, m.zz], dim=1)
+
+
+def _is_met(tiles: Rectangles, splats: Rectangles) -> Bool[Tensor, "batch tile splat"]:
+    """Which Gaussians each tile may meet: not apart on either axis. What is no number is met: it shall be seen.
+
+    NumPy compares in a fraction of the time that torch takes on a CPU.
+    """
+    on_cpu = tiles[0].device.type == "cpu"
+    first, last, low, high = (part.numpy() if on_cpu else part for part in (*tiles, *splats))
+    is_apart = low[0, :, None] > last[0, :, :, None]
+    is_apart |= high[0, :, None] < first[0, :, :, None]
+    is_apart |= low[1, :, None] > last[1, :, :, None]
+    is_apart |= high[1, :, None] < first[1, :, :, None]
+    return torch.as_tensor(~is_apart)
+
+
+def _classes(is_met: Bool[Tensor, "batch tile splat"]) -> list[TileClass]:
+    num_splats = is_met.shape[-1]
+    flat = places_of(is_met)
+    tile = quotient(flat, num_splats)
+    counts = torch.bincount(tile, minlength=is_met.shape[0] * is_met.shape[1])
+    start = counts.cumsum(0) - counts
+    splats = pad(flat.sub_(tile, alpha=num_splats), (0, 1), value=num_splats)
+    by_count = counts.argsort()[int((counts == 0).sum()) :]
     found = []
-    for chosen in classes:
-        met, candidates = is_met[chosen].to(torch.uint8).topk(int(counts[chosen[-1]]), dim=-1)
-        entry = chosen // (points.shape[1] // TILE)
-        flat = (candidates + entry[:, None] * rgb.shape[1]).flatten()
-        taken = table.index_select(0, flat).unflatten(0, candidates.shape)
-        found.append(
-            Encounter(
-                taken[..., :10].mT.contiguous(),
-                taken[..., 10] * met,
-                taken[..., 11:],
-                features[chosen],
-                nearest[chosen],
-                chosen,
-            )
-        )
+    for chosen in by_count.tensor_split(min(CLASSES, max(1, len(by_count) // TILE))) if len(by_count) else ():
+        own = counts[chosen]
+        rank = torch.arange(int(own[-1]), device=own.device)
+        place = (start[chosen][:, None] + rank).masked_fill_(rank >= own[:, None], len(splats) - 1)
+        found.append(TileClass(chosen, splats[place]))
     return found
-
-
-def tile_radius(
-    points: Float[Tensor, "tile ray 3"], directions: Float[Tensor, "tile ray 3"]
-) -> tuple[Float[Tensor, "tile 1 3"], Float[Tensor, "tile 1 3"], Float[Tensor, ""]]:
-    """Middle point and direction of each tile, and how far its rays stray from that middle ray inside the box."""
-    point = points.mean(dim=1, keepdim=True)
-    direction = torch.nn.functional.normalize(directions.mean(dim=1, keepdim=True), dim=-1)
-    stray = (points - point).norm(dim=-1) + _INSIDE * (directions - direction).norm(dim=-1)
-    return point, direction, stray.max()
-
-
-def _is_met(splats: Splats, middle: Tensor, toward: Tensor, radius: Tensor, batch: int) -> Bool[Tensor, "tile splat"]:
-    """Which Gaussians each tile may meet."""
-    limit = reach_limit(splats.opacity).clamp(min=1e-3)
-    ball = (1 + 1 / _SHARE) * radius**2 / limit
-    outer = (splats.precision.inverse() * (1 + _SHARE)).plus_diagonal(ball, ball, ball).inverse()
-    coefficients = splat_coefficients(Splats(splats.mean, outer, splats.opacity))
-    features = ray_features(*(rays.view(batch, -1, 3) for rays in (middle, toward)))
-    c, b, e = (part @ coefficients[:, : part.shape[-1]] for part in features)
-    return (c - b * b / e < reach_limit(splats.opacity)[:, None]).flatten(0, 1)
