@@ -157,6 +157,22 @@ def test_a_run_by_processor_seconds_ends_and_goes_on(
     assert rates[-1] < rates[0]  # the schedule follows the processors
 
 
+@pytest.mark.parametrize(("length", "expected"), [({"cpu_seconds": 0.2}, 1), ({"steps": 2}, 3)])
+def test_a_run_by_processor_time_keeps_to_one_thread(
+    store: PatchStore, tmp_path: Path, length: dict[str, float], expected: int
+) -> None:
+    seen: list[int] = []
+    threads = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        config = dataclasses.replace(TINY, **length)
+        train(config, store, tmp_path, device="cpu", on_save=lambda *_: seen.append(torch.get_num_threads()))
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(threads)
+    assert set(seen) == {expected}
+
+
 def test_a_teams_processor_seconds_are_added_up(store: PatchStore, tmp_path: Path) -> None:
     """Two processes start at the same moment and share each step: together they spend more than one thread could."""
     config = dataclasses.replace(TINY, cpu_seconds=1.0)

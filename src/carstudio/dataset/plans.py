@@ -3,13 +3,10 @@
 import hashlib
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
-
-import torch
 
 from carstudio.dataset.candidates import FrameResult, records_of_frame
 from carstudio.dataset.filters import DVM_CARS, FilterRecipe
@@ -23,7 +20,7 @@ from carstudio.dataset.sources.kitti_det import open_kitti_det
 from carstudio.dataset.sources.kitti_mot import open_kitti_mot
 from carstudio.dataset.sources.photo_files import find_photos
 from carstudio.dataset.sources.photos import open_photos
-from carstudio.devices import pick_device
+from carstudio.devices import one_thread, pick_device
 from carstudio.errors import InputError
 from carstudio.images import decode_image
 from carstudio.perception.specs import make_detector, make_segmenter
@@ -129,17 +126,6 @@ class FrameJob:
                 return [f"frame {frames[0].frame_id} skipped: {error}"]
         pairs = zip(frames, pictures, strict=True)
         return [self._recognise([frame], [picture])[0] for frame, picture in pairs]
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """As in a worker process, so that the number of processes changes no byte."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 @dataclass(frozen=True)

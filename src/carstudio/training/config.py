@@ -42,7 +42,8 @@ class TrainConfig:
     """Stop after this much time instead, and let the learning rate follow the clock."""
     cpu_seconds: float | None = None
     """Stop after so many processor seconds instead, those of all processes of a team together; the learning rate
-    follows them. What rows of a table have in common."""
+    follows them. What rows of a table have in common. A single process keeps to one thread of a CPU: several spend
+    processor seconds waiting for each other."""
     optimizer: OptimizerName = "radam"
     """radam: the paper's; adamw: CodeNeRF's; adam: one fused kernel, the least work per step."""
     second_moment: float = 0.999

@@ -23,6 +23,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from carstudio.dataset.workers import begin_worker, blocked_stops, start_tracker
+from carstudio.devices import one_thread
 from carstudio.errors import InputError
 
 _LOOPBACK = {"linux": "lo", "darwin": "lo0"}  # gloo would listen where the host's name points to
@@ -146,14 +147,9 @@ def team_of(processes: int, device: torch.device, work: Callable[[Team], Any]) -
             f"--processes is for CPUs, found device {device}; for several GPUs: torchrun --nproc-per-node N -m "
             "carstudio train ..."
         )
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with tempfile.TemporaryDirectory() as folder, _others(processes, Path(folder), work) as complaints:
-            with _group(device, 0, processes, (Path(folder) / "meeting").as_uri()):
-                yield Team(0, processes, complaints)
-    finally:
-        torch.set_num_threads(threads)
+    with one_thread(), tempfile.TemporaryDirectory() as folder, _others(processes, Path(folder), work) as complaints:
+        with _group(device, 0, processes, (Path(folder) / "meeting").as_uri()):
+            yield Team(0, processes, complaints)
 
 
 @contextmanager

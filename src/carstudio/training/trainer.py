@@ -4,6 +4,7 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,7 +14,7 @@ import torch
 
 from carstudio.dataset.pixels import PatchCache
 from carstudio.dataset.store import PatchStore, open_store
-from carstudio.devices import pick_device
+from carstudio.devices import one_thread, pick_device
 from carstudio.errors import InputError, Interrupted
 from carstudio.files import remove_partials
 from carstudio.locks import LOCK_NAME, FolderLock
@@ -78,7 +79,8 @@ def train(
             f"processes share a step's patches: expected 1 to {config.patches_per_step}, found {processes}"
         )
     along = partial(_train_along, config, store.path, out, device, init)
-    with team_of(processes, place, along) as team:
+    keeps_to_one = config.cpu_seconds is not None and place.type == "cpu"
+    with one_thread() if keeps_to_one else nullcontext(), team_of(processes, place, along) as team:
         run = _Run(config, store, out, place, provenance or {}, team)
         if not team.is_first:
             _steps_along(run, init)
