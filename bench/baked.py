@@ -11,6 +11,7 @@ import platform
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 import tyro
@@ -61,7 +62,8 @@ def likeness(
         crop = (slice(y, y + height), slice(x, x + width))
         error = (full["rgb"] - fast["rgb"])[crop].square().mean(dim=-1)
         is_car = full["opacity"][crop] > 0.5
-        found.append(tuple(float(-10 * part.mean().log10()) for part in (error, error[is_car])))
+        on_crop, on_car = (float(-10 * part.mean().log10()) for part in (error, error[is_car]))
+        found.append((on_crop, on_car))
     return found
 
 
@@ -92,8 +94,8 @@ def main(bench: Bench) -> None:
     for size_px in bench.sizes:
         camera = orbit_camera(size_px)
         ways: dict[str, Callable[[], object]] = {
-            "baked": lambda c=camera: baked.render(c, box),
-            "model": lambda c=camera: render_image(model, c, latents, box),
+            "baked": partial(baked.render, camera, box),
+            "model": partial(render_image, model, camera, latents, box),
         }
         num_rays = {"baked": size_px**2, "model": size_px**2, YARDSTICK: bench.yardstick_size**2}
         if bench.yardstick_size:

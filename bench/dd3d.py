@@ -54,9 +54,11 @@ def random_network(backbone: Backbone, image: torch.Tensor) -> DD3D:
         (heads3d.box3d_conf[0], "confidence"),
     ):
         values = torch.cat([getattr(level, name).flatten() for level in outputs])
+        assert isinstance(predictor, torch.nn.Conv2d)
         predictor.weight.div_(values.std())
-    heads2d.cls_logits.bias.fill_(LOGIT_BIAS)
-    heads2d.box2d_reg.bias.fill_(4.0)
+    for predictor, bias in ((heads2d.cls_logits, LOGIT_BIAS), (heads2d.box2d_reg, 4.0)):
+        assert predictor.bias is not None
+        predictor.bias.fill_(bias)
     return network
 
 

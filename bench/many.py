@@ -16,6 +16,7 @@ from bench.subject import Subject, measure
 from carstudio.allocator import keep_freed_memory
 from carstudio.geometry.orbit import orbit_camera
 from carstudio.models.baked import bake
+from carstudio.models.car_gaussians import CarGaussiansConfig
 from carstudio.recipes import car_gaussians
 from carstudio.training.config import TrainConfig
 
@@ -33,7 +34,8 @@ class Bench:
 def recipe_of(num_splats: int) -> TrainConfig:
     """`car-gaussians` with another number of Gaussians."""
     config = car_gaussians()
-    return replace(config, model=replace(config.model, num_splats=num_splats))  # type: ignore[type-var]
+    assert isinstance(config.model, CarGaussiansConfig)
+    return replace(config, model=replace(config.model, num_splats=num_splats))
 
 
 def exponent(counts: tuple[int, ...], seconds: list[float]) -> float:

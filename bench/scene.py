@@ -46,7 +46,8 @@ def made_up_scene(folder: Path, frames: int) -> Scene:
     size, turn = (4.2, 1.5, 1.8), quaternion_from_rotation(rotation_y(torch.tensor(-1.5, dtype=torch.float64)))
     tracks = {}
     for i, (x, z) in enumerate(PLACES):
-        codes = Latents(*(torch.randn(1, size, generator=random) for size in sizes))
+        shape, texture = (torch.randn(1, size, generator=random) for size in sizes)
+        codes = Latents(shape, texture)
         car = Car(
             codes, size, "car-gaussians", described.sha256, f"car-{i}", "CC0-1.0", provenance={"scene_key": "bench"}
         )

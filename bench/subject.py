@@ -15,7 +15,7 @@ from carstudio.rendering.rays import to_canonical
 from carstudio.training.batches import generator_for
 from carstudio.training.config import TrainConfig
 from carstudio.training.losses import training_loss
-from carstudio.training.optimizers import build_optimizer
+from carstudio.training.optimizers import build_optimizer, clip
 from carstudio.training.precision import Precision, autocast
 
 
@@ -37,8 +37,13 @@ class Subject:
         self.optimizer = build_optimizer(self.model, self.config.optimizer, rate=1e-4)
         own = self.config.rays_per_patch
         rays_per_patch = rays_per_patch or (own if own <= 512 else 128)
-        batch = random_batch(self.config.patches_per_step, rays_per_patch, self.model.encoder_side_px)
-        self.patches, self.pixels = (part.to(device) for part in batch)
+        patches, pixels = random_batch(
+            self.config.patches_per_step,
+            rays_per_patch,
+            self.model.encoder_side_px,
+            in_tiles=self.config.pixels == "in-cells",
+        )
+        self.patches, self.pixels = patches.to(device), pixels.to(device)
         self.precision = precision or self.config.precision
         self.rays_per_patch = rays_per_patch
         self.rays, self.size_px = self.config.patches_per_step * rays_per_patch, size_px
@@ -55,6 +60,8 @@ class Subject:
         terms = training_loss(rendered, self.pixels.rgb, self.pixels.alpha, counts, self.config.loss)
         self.optimizer.zero_grad(set_to_none=True)
         torch.stack(list(terms.values())).sum().backward()
+        if self.config.clip_gradient is not None:
+            clip(list(self.model.parameters()), self.config.clip_gradient)
         self.optimizer.step()
 
     def encode_first(self) -> None:
