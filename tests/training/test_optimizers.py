@@ -223,5 +223,10 @@ def test_the_command_line_names_budget_and_optimiser(tmp_path: Path) -> None:
     assert (command.config().cpu_seconds, command.config().optimizer) == (9.0, "adam")
     plain = Train(recipe="code-nerf", data=tmp_path, out=tmp_path).config()
     assert (plain.cpu_seconds, plain.optimizer) == (None, "adamw")
+    assert (
+        Train(recipe="car-gaussians", data=tmp_path, out=tmp_path, patches_per_step=64).config().patches_per_step == 64
+    )
+    with pytest.raises(InputError, match="patches-per-step must be 1 or more, found 0"):
+        Train(recipe="car-gaussians", data=tmp_path, out=tmp_path, patches_per_step=0).config()
     with pytest.raises(InputError, match="give one"):
         Train(recipe="car-nerf", data=tmp_path, out=tmp_path, cpu_seconds=9.0, minutes=1.0).config()

@@ -55,6 +55,8 @@ class Train(Output):
     learning_rate: float | None = None
     """First learning rate; the last one keeps its ratio to it (the recipe's own when absent; less for a
     short run from --init: for fields a tenth, or they forget what they started from)."""
+    patches_per_step: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Photos of a step (the recipe's own when absent): more for several processes, which pay for a step each."""
     supervision: Supervision | None = None
     """Which photo an encoded photo must explain (the recipe's own when absent)."""
     box_noise: float | None = None
@@ -72,6 +74,10 @@ class Train(Output):
         config = replace(config, cpu_seconds=self.cpu_seconds, optimizer=self.optimizer or config.optimizer)
         if self.steps is not None:
             config = replace(config, steps=self.steps)
+        if self.patches_per_step is not None:
+            if self.patches_per_step < 1:
+                raise InputError(f"--patches-per-step must be 1 or more, found {self.patches_per_step}")
+            config = replace(config, patches_per_step=self.patches_per_step)
         if self.supervision is not None:
             config = supervised(config, self.supervision)
         if self.box_noise is not None:
