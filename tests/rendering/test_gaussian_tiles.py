@@ -147,6 +147,20 @@ def test_what_reaches_to_the_camera_or_is_no_number_is_left_to_the_rays() -> Non
         assert not bool((one.splats == 3).any())
 
 
+def test_a_ray_that_is_no_number_is_seen_and_costs_no_other() -> None:
+    rays, cloud, box = tile_rays(48), surface_cloud(), car_box()
+    directions = rays.directions.clone()
+    directions[:, 700] = torch.nan
+    broken = replace(rays, directions=directions)
+    assert classes_of(cloud, broken, box) is not None
+    config = SplattingConfig(most=400, widen=False)  # a footprint is the mean of all rays'
+    found = trace_cloud(cloud, broken, to_canonical(broken, box), config)
+    whole = trace_cloud(cloud, rays, to_canonical(rays, box), config)
+    others = torch.arange(48 * 48) != 700
+    assert torch.equal(found.alpha[:, others], whole.alpha[:, others])
+    assert bool(found.distance_m[:, 700].isnan().any())
+
+
 def test_scattered_rays_are_no_tiles() -> None:
     """Nor are rays of two cameras, nor those of a camera beside the car's middle."""
     rays, cloud = tile_rays(32), surface_cloud()
